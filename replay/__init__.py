@@ -1,0 +1,1 @@
+"""The replayer: streams recordings into a running service over HTTP."""

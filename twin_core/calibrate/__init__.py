@@ -1,0 +1,1 @@
+"""Calibration: fitting a declared network to measured temperatures."""

@@ -1,0 +1,1 @@
+"""The closed loop: residual, diagnosis, new model term, held-out error."""

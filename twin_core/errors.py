@@ -1,0 +1,21 @@
+"""Errors: one root, few children. Every message names the field, row or node and says what to do."""
+
+
+class TwinError(Exception):
+    """Wrong input or an impossible request. The command line shows it in one line and exits with 2."""
+
+
+class SpecError(TwinError):
+    """A field of a specification, scenario or model file is wrong."""
+
+
+class TelemetryError(TwinError):
+    """A telemetry file, row or channel is wrong."""
+
+
+class ModelError(TwinError):
+    """A request that the network or the model cannot answer, such as a node that does not exist."""
+
+
+class Cancelled(TwinError):
+    """A long job was asked to stop."""

@@ -1,0 +1,1 @@
+"""The finite-element simulator of orbits: mesh, forms, time stepping, scenario files."""

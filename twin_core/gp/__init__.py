@@ -1,0 +1,1 @@
+"""Gaussian processes as state-space models: kernels, discretisation, Kalman filter and smoother."""

@@ -1,0 +1,1 @@
+"""The declared thermal network: its specification, its arrays and its heat balance."""

@@ -1,0 +1,383 @@
+"""The twin specification: what the operator declares, validated, with one clear message for what is wrong."""
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from twin_core.errors import SpecError, TelemetryError
+from twin_core.units import parse_instant_ns
+
+
+def _not_boolean(value: Any) -> Any:
+    """Refuse true and false where a number is wanted: Python would take them for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
+Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
+Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$")]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(_Strict):
+    """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``)."""
+
+    value: Positive | None = None
+    guess: Positive | None = None
+    bounds: tuple[Positive, Positive] | None = None
+
+    @model_validator(mode="after")
+    def _one_meaning(self) -> Self:
+        if self.value is not None and (self.guess is not None or self.bounds is not None):
+            raise ValueError("give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both")
+        if self.bounds is not None:
+            low, high = self.bounds
+            if not low < high:
+                raise ValueError(f"bounds contradict each other: {low:g} is not below {high:g}")
+            if self.guess is not None and not low <= self.guess <= high:
+                raise ValueError(f"guess {self.guess:g} lies outside its bounds {low:g} to {high:g}")
+        return self
+
+
+class Boundary(_Strict):
+    """A temperature that is given: a constant, a telemetry channel, or one unknown constant with a guess."""
+
+    value_K: Temperature | None = None
+    channel: Name | None = None
+    guess_K: Temperature | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if sum(item is not None for item in (self.value_K, self.channel, self.guess_K)) != 1:
+            raise ValueError("give exactly one of 'value_K', 'channel', 'guess_K'")
+        return self
+
+
+class Channel(_Strict):
+    """One telemetry column that the twin uses."""
+
+    kind: Literal["temperature", "power", "auxiliary"]
+    unit: str | None = None
+    noise_std: Positive | None = None
+    interpolation: Literal["hold", "linear"] | None = None
+    levels: bool = False
+
+    @model_validator(mode="after")
+    def _unit_fits_kind(self) -> Self:
+        allowed = {"temperature": ("K", "degC"), "power": ("W", "percent")}.get(self.kind)
+        if allowed and self.unit not in allowed:
+            raise ValueError(f"unit of a {self.kind} channel is {' or '.join(allowed)} (got {self.unit!r})")
+        if self.levels and self.kind != "auxiliary":
+            raise ValueError("only an auxiliary channel has levels")
+        if self.noise_std is not None and self.kind != "temperature":
+            raise ValueError("noise_std belongs to a temperature channel")
+        if self.levels and self.interpolation == "linear":
+            raise ValueError("a channel with levels is held, not interpolated")
+        return self
+
+    @property
+    def is_held(self) -> bool:
+        """True where a sample holds until the next one, False where values are interpolated linearly."""
+        if self.interpolation is not None:
+            return self.interpolation == "hold"
+        return self.kind == "power" or self.levels
+
+
+class Node(_Strict):
+    """A lumped thermal mass; without a sensor it is a hidden state."""
+
+    id: Name
+    sensor: Name | tuple[Name, ...] | None = None
+    capacity_J_per_K: Quantity | None = None
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The temperature channels that read this node."""
+        if self.sensor is None:
+            return ()
+        return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
+
+
+class Conductor(_Strict):
+    """A symmetric linear coupling GL (W/K) between two nodes, or a node and a boundary."""
+
+    between: tuple[Name, Name]
+    conductance_W_per_K: Quantity | None = None
+
+    @field_validator("between")
+    @classmethod
+    def _two_ends(cls, value: tuple[str, str]) -> tuple[str, str]:
+        if value[0] == value[1]:
+            raise ValueError(f"joins '{value[0]}' to itself")
+        return value
+
+
+class Radiator(_Strict):
+    """Declared and known radiation: sigma * emissivity * area * (T_sink^4 - T^4) into the node."""
+
+    node: Name
+    emissivity: Fraction
+    area_m2: Positive
+    sink: Name
+
+
+class Table(_Strict):
+    """Heat as an unknown function of an auxiliary channel: piecewise linear over knots, or one value per level."""
+
+    knots: tuple[Number, ...] | None = None
+
+    @field_validator("knots")
+    @classmethod
+    def _increasing(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if value is not None and (len(value) < 2 or any(b <= a for a, b in zip(value, value[1:], strict=False))):
+            raise ValueError("knots must be at least two and strictly increasing")
+        return value
+
+
+class Load(_Strict):
+    """A declared heat input into one node."""
+
+    channel: Name
+    node: Name
+    weight: Fraction = 1.0
+    gain: Quantity | None = None
+    solar: bool = False
+    table: Table | None = None
+
+
+class Interval(_Strict):
+    """An interval that takes no part in any fit or score."""
+
+    start: str | Number
+    stop: str | Number
+    reason: str = ""
+
+    @field_validator("start", "stop")
+    @classmethod
+    def _is_time(cls, value: str | float) -> str | float:
+        if isinstance(value, str):
+            try:
+                parse_instant_ns(value)
+            except TelemetryError as error:
+                raise ValueError(str(error)) from error
+        return value
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        if isinstance(self.start, str) != isinstance(self.stop, str):
+            raise ValueError("start and stop must both be dates or both be seconds")
+        start, stop = (parse_instant_ns(x) if isinstance(x, str) else x for x in (self.start, self.stop))
+        if not start < stop:
+            raise ValueError("stop must come after start")
+        return self
+
+
+class Criteria(_Strict):
+    """Correlation acceptance. The defaults are the usual test-correlation goals: 2 K of bias, 5 K for 99 % of samples."""
+
+    bias_K: Positive = 2.0
+    q99_abs_K: Positive = 5.0
+
+
+class TwinSpec(_Strict):
+    """The whole specification of a twin (contract section 3)."""
+
+    twin: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")]
+    boundaries: dict[Name, Boundary] = Field(default_factory=dict)
+    channels: dict[Name, Channel]
+    nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
+    conductors: tuple[Conductor, ...] = ()
+    radiators: tuple[Radiator, ...] = ()
+    loads: tuple[Load, ...] = ()
+    exclude: tuple[Interval, ...] = ()
+    criteria: Criteria = Criteria()
+
+    @model_validator(mode="after")
+    def _names_resolve(self) -> Self:
+        for problem in self._problems():
+            raise ValueError(problem)
+        return self
+
+    def _problems(self) -> Iterable[str]:
+        """Yield every broken reference, the first of which becomes the message."""
+        nodes = [node.id for node in self.nodes]
+        yield from (f"nodes[{i}].id: '{n}' is declared twice" for i, n in enumerate(nodes) if n in nodes[:i])
+        yield from (f"boundaries.{name}: a node has the same id" for name in self.boundaries if name in nodes)
+        for name, boundary in self.boundaries.items():
+            if boundary.channel is not None:
+                yield from self._check_channel(f"boundaries.{name}.channel", boundary.channel, ("temperature",))
+        seen: dict[str, str] = {}
+        for i, node in enumerate(self.nodes):
+            for sensor in node.sensors:
+                yield from self._check_channel(f"nodes[{i}].sensor", sensor, ("temperature",))
+                if sensor in seen:
+                    yield f"nodes[{i}].sensor: '{sensor}' already reads node '{seen[sensor]}'"
+                seen[sensor] = node.id
+        if not seen:
+            yield "nodes: none has a sensor; name the temperature channel of at least one node"
+        yield from self._check_conductors(nodes)
+        for i, radiator in enumerate(self.radiators):
+            yield from self._check_end(f"radiators[{i}].node", radiator.node, nodes)
+            yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
+        yield from self._check_loads(nodes)
+
+    def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
+        pairs: set[frozenset[str]] = set()
+        for i, conductor in enumerate(self.conductors):
+            ends = frozenset(conductor.between)
+            for end in conductor.between:
+                yield from self._check_end(f"conductors[{i}].between", end, [*nodes, *self.boundaries], "node or boundary")
+            if ends <= set(self.boundaries):
+                yield f"conductors[{i}].between: joins two boundaries; one end must be a node"
+            if ends in pairs:
+                yield f"conductors[{i}].between: {' and '.join(conductor.between)} are joined twice; add the conductances"
+            pairs.add(ends)
+
+    def _check_loads(self, nodes: list[str]) -> Iterable[str]:
+        weights: dict[str, float] = {}
+        for i, load in enumerate(self.loads):
+            yield from self._check_end(f"loads[{i}].node", load.node, nodes)
+            yield from self._check_channel(f"loads[{i}].channel", load.channel, ("power", "auxiliary"))
+            channel = self.channels[load.channel]
+            if load.table is None and channel.kind == "auxiliary":
+                yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
+            if load.table is not None and load.gain is not None:
+                yield f"loads[{i}].gain: a load with a table has no gain; its values are calibrated"
+            if load.table is not None and channel.levels is False and load.table.knots is None:
+                yield f"loads[{i}].table.knots: missing; '{load.channel}' has no levels"
+            if load.table is None and load.gain is None and channel.unit == "W":
+                weights[load.channel] = weights.get(load.channel, 0.0) + load.weight
+        for name, total in weights.items():
+            if total > 1.0 + 1e-9:
+                yield f"loads: the weights of channel '{name}' add to {total:g}; they may add to 1 at most"
+
+    def _check_channel(self, field: str, name: str, kinds: tuple[str, ...]) -> Iterable[str]:
+        if name not in self.channels:
+            yield f"{field}: unknown channel '{name}'; declare it under channels (known: {', '.join(self.channels) or 'none'})"
+        elif self.channels[name].kind not in kinds:
+            yield f"{field}: channel '{name}' is {self.channels[name].kind}, must be {' or '.join(kinds)}"
+
+    @staticmethod
+    def _check_end(field: str, name: str, known: list[str], what: str = "node") -> Iterable[str]:
+        if name not in known:
+            yield f"{field}: unknown {what} '{name}' (known: {', '.join(known) or 'none'})"
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Every sensor channel, in the order of the nodes."""
+        return tuple(sensor for node in self.nodes for sensor in node.sensors)
+
+    @property
+    def used_channels(self) -> tuple[str, ...]:
+        """Every channel that a node, boundary or load uses, and every auxiliary channel that may explain heat."""
+        used = set(self.sensors) | {load.channel for load in self.loads}
+        used |= {b.channel for b in self.boundaries.values() if b.channel is not None}
+        used |= {name for name, channel in self.channels.items() if channel.kind != "temperature"}
+        return tuple(name for name in self.channels if name in used)
+
+    def noise_std_K(self, sensor: str) -> float | None:
+        """The declared noise of a sensor in kelvin (a difference: the same number in degC)."""
+        return self.channels[sensor].noise_std
+
+
+def _one_line(error: ValidationError) -> str:
+    """Return the first problem of a validation as ``field: what is wrong``."""
+    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+    where = ""
+    for part in first["loc"]:
+        where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        message = "unknown field; remove it or correct its spelling"
+    elif first["type"] == "missing":
+        message = "is missing"
+    elif first["type"] != "value_error" and not isinstance(first["input"], dict | list):
+        message += f" (got {first['input']!r})"
+    return f"{where}: {message}" if where else message
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """A safe YAML loader that refuses a key that stands twice, where YAML would silently keep the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                raise SpecError(f"line {node.value[i][0].start_mark.line + 1}: '{key}' stands twice")
+        return super().construct_mapping(node, deep)
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read a YAML or JSON file whose top level is a mapping.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, is not YAML or JSON, or is not a mapping.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a text file"
+        raise SpecError(f"{path}: cannot be read ({reason})") from error
+    try:
+        data = yaml.load(text, Loader=_UniqueKeys) if Path(path).suffix != ".json" else json.loads(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f"line {mark.line + 1}: " if mark else ""
+        raise SpecError(f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})") from error
+    except json.JSONDecodeError as error:
+        raise SpecError(f"{path}: line {error.lineno}: not valid JSON ({error.msg})") from error
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}") from error
+    if not isinstance(data, dict):
+        raise SpecError(f"{path}: the top level must be a mapping of fields, got {type(data).__name__}")
+    return data
+
+
+def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
+    """Return the validated specification from a YAML or JSON file, or from its parsed mapping.
+
+    Raises
+    ------
+    SpecError
+        With one line that names the file and the field, and says what is wrong.
+    """
+    prefix = "" if isinstance(source, dict) else f"{source}: "
+    data = source if isinstance(source, dict) else read_mapping(Path(source))
+    try:
+        return TwinSpec.model_validate(data)
+    except ValidationError as error:
+        raise SpecError(prefix + _one_line(error)) from error
+
+
+def dump_spec(spec: TwinSpec) -> dict[str, Any]:
+    """Return the specification as plain data that ``load_spec`` reads back; absent fields are left out."""
+    return spec.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
+
+
+def guess_or(quantity: Quantity | None, default: float) -> float:
+    """Return the value or guess of a quantity, or ``default`` where neither is declared."""
+    if quantity is None:
+        return default
+    for number in (quantity.value, quantity.guess):
+        if number is not None:
+            return number
+    if quantity.bounds is not None:
+        return math.sqrt(quantity.bounds[0] * quantity.bounds[1])
+    return default
+
+
+__all__ = ["TwinSpec", "dump_spec", "guess_or", "load_spec", "read_mapping"]

@@ -1,0 +1,1 @@
+"""The rollout of a thermal network and its exact sensitivities."""

@@ -1,0 +1,80 @@
+"""A record: channels on one strictly increasing time axis, in SI, with NaN where a sample is missing."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.errors import TelemetryError
+from twin_core.units import format_instant, parse_instant_ns
+
+
+@dataclass(frozen=True)
+class Record:
+    """One segment of telemetry.
+
+    Attributes
+    ----------
+    time_s : (n_times,)
+        Seconds, strictly increasing, counted from ``epoch_ns``; the file's own seconds where there is no epoch.
+    values : channel name -> (n_times,)
+        SI (K, W; percent and auxiliary units as they are); NaN is a missing sample.
+    epoch_ns
+        Unix nanoseconds of ``time_s = 0``; None where the record carries no dates.
+    name
+        Where it came from, for messages.
+    """
+
+    time_s: FloatArray
+    values: Mapping[str, FloatArray]
+    epoch_ns: int | None = None
+    name: str = "record"
+    notices: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Check the axis and the shapes; raise TelemetryError naming the first offender."""
+        if self.time_s.ndim != 1 or self.time_s.size == 0:
+            raise TelemetryError(f"{self.name}: holds no samples")
+        if not np.isfinite(self.time_s).all():
+            raise TelemetryError(f"{self.name}: row {int(np.argmin(np.isfinite(self.time_s))) + 1}: time is not finite")
+        steps = np.diff(self.time_s)
+        if (steps <= 0).any():
+            row = int(np.argmax(steps <= 0)) + 2
+            raise TelemetryError(f"{self.name}: row {row}: time does not increase; sort the rows, drop repeated ones")
+        for channel, column in self.values.items():
+            if column.shape != self.time_s.shape:
+                raise TelemetryError(f"{self.name}: channel '{channel}' has {column.size} samples, time has {steps.size + 1}")
+
+    def channel(self, name: str) -> FloatArray:
+        """Return one channel, (n_times,); TelemetryError if the record lacks it."""
+        if name not in self.values:
+            raise TelemetryError(f"{self.name}: channel '{name}' is missing; the file has {', '.join(self.values)}")
+        return self.values[name]
+
+    def between(self, start_s: float, stop_s: float) -> "Record":
+        """Return the samples with start_s <= time_s < stop_s; TelemetryError if there are none."""
+        keep = (self.time_s >= start_s) & (self.time_s < stop_s)
+        return self.take(keep)
+
+    def take(self, keep: np.ndarray) -> "Record":
+        """Return the samples that the mask or index ``keep`` selects."""
+        return Record(
+            self.time_s[keep],
+            {name: column[keep] for name, column in self.values.items()},
+            self.epoch_ns,
+            self.name,
+            self.notices,
+        )
+
+    def present(self, time_s: float) -> str | float:
+        """Return a time in the telemetry's own form: RFC 3339 where the record is dated, else seconds."""
+        return float(time_s) if self.epoch_ns is None else format_instant(self.epoch_ns + round(float(time_s) * 1e9))
+
+    def locate_s(self, time: str | float) -> float:
+        """Return the record's own seconds of a time given in either form; TelemetryError if the form does not fit."""
+        if isinstance(time, str):
+            if self.epoch_ns is None:
+                raise TelemetryError(f"{self.name}: '{time}' is a date, the record counts seconds")
+            return (parse_instant_ns(time) - self.epoch_ns) / 1e9
+        return float(time)
