@@ -1,0 +1,122 @@
+"""Levenberg-Marquardt on the normal equations: a second-order solver whose outcome is a value, never silence."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.calibrate.problem import Fit, Problem
+
+Status = Literal["converged", "stalled", "iteration_limit", "no_solution"]
+
+ADVICE: dict[Status, str] = {
+    "converged": "the cost no longer falls",
+    "stalled": "no step lowers the cost any more: the data hardly tell some parameters apart",
+    "iteration_limit": "stopped at the iteration limit while the cost still fell: start from better guesses",
+    "no_solution": "the heat balance has no solution at the guesses: check the order of magnitude of loads and radiators",
+}
+
+LARGEST_STEP = 2.0
+"""Longest move of a logarithmic parameter in one iteration: a factor of e^2."""
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """Where the search ended.
+
+    Attributes
+    ----------
+    unknowns : (n_unknowns,)
+    fit
+        The model there.
+    hessian : (n_unknowns, n_unknowns)
+        Gauss-Newton Hessian of the cost there.
+    status, iterations
+        Why and when it stopped; ``ADVICE`` says what to do.
+    """
+
+    unknowns: FloatArray
+    fit: Fit
+    hessian: FloatArray
+    status: Status
+    iterations: int
+
+
+def _step(hessian: FloatArray, gradient: FloatArray, damping: float) -> FloatArray:
+    """Return the damped Newton step, scaled so that every unknown counts alike."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    scaled = hessian * scale[:, None] * scale[None, :]
+    scaled[np.diag_indices_from(scaled)] += damping
+    try:
+        step = cho_solve(cho_factor(scaled), -gradient * scale) * scale
+    except LinAlgError:
+        step = -np.linalg.pinv(scaled, rcond=1e-12) @ (gradient * scale) * scale
+    return step
+
+
+def _limited(step: FloatArray, logarithmic: IntArray) -> FloatArray:
+    """Return the step shortened as a whole where a logarithmic parameter would leap."""
+    longest = np.abs(step[logarithmic]).max(initial=0.0)
+    return step * min(1.0, LARGEST_STEP / longest) if longest > 0 else step
+
+
+def minimise(
+    problem: Problem,
+    unknowns: FloatArray | None = None,
+    *,
+    near: Fit | None = None,
+    max_iterations: int = 60,
+    tolerance: float = 1e-7,
+) -> Optimum:
+    """Minimise the cost of a problem.
+
+    Parameters
+    ----------
+    problem
+        What is fitted to what.
+    unknowns : (n_unknowns,)
+        Where to start; the problem's own start by default.
+    near
+        A fit close to the start, to save Newton iterations.
+    max_iterations
+        Accepted steps at most.
+    tolerance
+        Stop when an accepted step lowers the cost by less than this share.
+
+    Returns
+    -------
+    Optimum
+        With a status; a failure is a value (Madsen, Nielsen and Tingleff 2004, algorithm 3.16 for the damping).
+    """
+    x = problem.start() if unknowns is None else unknowns.copy()
+    fit = problem.solve(x, near)
+    if not np.isfinite(fit.cost):
+        return Optimum(x, fit, np.eye(x.size), "no_solution", 0)
+    damping, growth = 1e-3, 2.0
+    status: Status = "iteration_limit"
+    hessian, gradient = problem.normal_equations(x, fit)
+    iterations = 0
+    while iterations < max_iterations:
+        step = _limited(_step(hessian, gradient, damping), problem.logarithmic)
+        predicted = -(gradient @ step + 0.5 * step @ hessian @ step)
+        trial = problem.solve(x + step, fit)
+        gain = (fit.cost - trial.cost) / max(predicted, 1e-300) if np.isfinite(trial.cost) else -1.0
+        if gain > 1e-4:
+            fall = (fit.cost - trial.cost) / max(fit.cost, 1e-300)
+            x, fit, iterations = x + step, trial, iterations + 1
+            damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
+            hessian, gradient = problem.normal_equations(x, fit)
+            if fall < tolerance:
+                status = "converged"
+                break
+        elif predicted <= tolerance * fit.cost:
+            status = "converged"
+            break
+        else:
+            damping, growth = damping * growth, growth * 2.0
+            if damping > 1e12:
+                status = "stalled"
+                break
+    return Optimum(x, fit, hessian, status, iterations)

@@ -1,0 +1,267 @@
+"""What is fitted to what: the trajectories of all segments against their measured temperatures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin_core._typing import BoolArray, FloatArray, IntArray
+from twin_core.errors import TelemetryError
+from twin_core.network.model import Network
+from twin_core.network.spec import Interval, TwinSpec
+from twin_core.parameters.transforms import Identity
+from twin_core.simulate.forcing import Forcing, build_forcing
+from twin_core.simulate.rollout import Rollout, rollout, sensitivities
+from twin_core.telemetry import Record
+
+START_STD_SENSED_K = 5.0
+START_STD_HIDDEN_K = 30.0
+"""Prior standard deviations of initial temperatures: around the first readings, and of nodes that nobody reads."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One continuous stretch of telemetry.
+
+    Attributes
+    ----------
+    record
+        Its samples.
+    forcing
+        Its steps and inputs.
+    measured_K : (n_samples, n_sensors)
+        NaN where a sample is missing or excluded.
+    start_prior_K, start_std_K : (n_nodes,)
+        Prior of the initial state.
+    """
+
+    record: Record
+    forcing: Forcing
+    measured_K: FloatArray
+    start_prior_K: FloatArray
+    start_std_K: FloatArray
+
+    @property
+    def valid(self) -> BoolArray:
+        """Which samples take part, (n_samples, n_sensors)."""
+        return np.isfinite(self.measured_K)
+
+
+def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
+    """Return which samples lie in an excluded interval, (n_times,)."""
+    mask = np.zeros(record.time_s.size, dtype=np.bool_)
+    for interval in intervals:
+        if isinstance(interval.start, str) != (record.epoch_ns is not None):
+            continue
+        start, stop = record.locate_s(interval.start), record.locate_s(interval.stop)
+        mask |= (record.time_s >= start) & (record.time_s < stop)
+    return mask
+
+
+def measured_temperatures(spec: TwinSpec, record: Record) -> FloatArray:
+    """Return the readings of all sensors, (n_times, n_sensors), NaN where missing or excluded."""
+    nothing = np.full(record.time_s.size, np.nan)
+    columns = [record.values.get(sensor, nothing) for sensor in spec.sensors]
+    measured = np.stack(columns, axis=1).astype(np.float64)
+    measured[excluded(record, spec.exclude)] = np.nan
+    return measured
+
+
+def _start_prior(network: Network, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and standard deviation of the initial temperatures, (n_nodes,) each."""
+    first = np.array([c[np.isfinite(c)][:3].mean() if np.isfinite(c).any() else np.nan for c in measured.T])
+    typical = float(np.nanmean(first)) if np.isfinite(first).any() else 293.15
+    mean = np.full(len(network.nodes), typical)
+    std = np.full(len(network.nodes), START_STD_HIDDEN_K)
+    for sensor, node in enumerate(network.sensor_node):
+        if np.isfinite(first[sensor]):
+            mean[node], std[node] = first[sensor], START_STD_SENSED_K
+    for extra in network.extra:
+        position = network.layout.node(extra.name)
+        if std[position] == START_STD_HIDDEN_K:
+            mean[position] = mean[network.layout.node(extra.like)]
+            std[position] = START_STD_SENSED_K
+    return mean, std
+
+
+def build_segment(network: Network, record: Record, max_step_s: float) -> Segment:
+    """Return the segment of a record; TelemetryError if it holds fewer than three samples of any sensor."""
+    measured = measured_temperatures(network.spec, record)
+    if record.time_s.size < 3 or int(np.isfinite(measured).sum()) < 3:
+        sensors = ", ".join(network.spec.sensors)
+        raise TelemetryError(f"{record.name}: fewer than three usable samples of {sensors}; nothing can be fitted")
+    mean, std = _start_prior(network, measured)
+    return Segment(record, build_forcing(network, record, max_step_s), measured, mean, std)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The model along all segments at one point of the search.
+
+    Attributes
+    ----------
+    cost
+        Half the sum of squared weighted residuals and prior deviations; infinite where a rollout has no solution.
+    trajectories
+        One rollout per segment.
+    predicted_K
+        One (n_samples, n_sensors) per segment: what the sensors should read.
+    """
+
+    cost: float
+    trajectories: tuple[Rollout, ...]
+    predicted_K: tuple[FloatArray, ...]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Trajectory matching (paper A, eq. 2) over all segments, with initial states among the unknowns.
+
+    The unknown vector x is the network's free parameters followed by the initial temperatures of each segment:
+    (n_free + n_segments * n_nodes,).
+    """
+
+    network: Network
+    segments: tuple[Segment, ...]
+    noise_K: FloatArray
+
+    @property
+    def n_free(self) -> int:
+        """Number of free network parameters."""
+        return int(self.network.parameters.free_index.size)
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of states."""
+        return len(self.network.nodes)
+
+    @property
+    def n_unknowns(self) -> int:
+        """Length of the unknown vector."""
+        return self.n_free + len(self.segments) * self.n_nodes
+
+    @property
+    def logarithmic(self) -> IntArray:
+        """Positions in the unknown vector of the parameters whose solver coordinate is logarithmic."""
+        free = [self.network.parameters.parameters[i] for i in self.network.parameters.free_index]
+        return np.array([k for k, p in enumerate(free) if not isinstance(p.transform, Identity)], dtype=np.int64)
+
+    def start(self) -> FloatArray:
+        """Return the unknown vector at the network's present values and the prior initial states."""
+        return np.concatenate([self.network.parameters.free, *(s.start_prior_K for s in self.segments)])
+
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and standard deviation of the unknowns; infinite standard deviation is a flat prior."""
+        mean = np.concatenate([self.network.parameters.free, *(s.start_prior_K for s in self.segments)])
+        std = np.concatenate([self.network.parameters.prior_std, *(s.start_std_K for s in self.segments)])
+        return mean, std
+
+    def start_columns(self, segment: int) -> slice:
+        """Return where the initial temperatures of a segment stand in the unknown vector."""
+        first = self.n_free + segment * self.n_nodes
+        return slice(first, first + self.n_nodes)
+
+    def values(self, unknowns: FloatArray) -> FloatArray:
+        """Return the physical parameter values, (n_parameters,)."""
+        return self.network.parameters.to_values(unknowns[: self.n_free])
+
+    def solve(self, unknowns: FloatArray, near: Fit | None = None) -> Fit:
+        """Roll all segments out; ``near`` is the fit from which Newton's method starts."""
+        values = self.values(unknowns)
+        mean, std = self.prior()
+        cost = 0.5 * float(np.sum(((unknowns - mean) / std) ** 2))
+        trajectories, predicted = [], []
+        for i, segment in enumerate(self.segments):
+            guess = None if near is None else near.trajectories[i].stages_K
+            path = rollout(self.network, values, unknowns[self.start_columns(i)], segment.forcing, near=guess)
+            trajectories.append(path)
+            predicted.append(self._readings(values, segment, path))
+            cost += 0.5 * float(np.nansum(((predicted[-1] - segment.measured_K) / self.noise_K) ** 2))
+            if not path.converged:
+                cost = np.inf
+                break
+        return Fit(cost, tuple(trajectories), tuple(predicted))
+
+    def _readings(self, values: FloatArray, segment: Segment, path: Rollout) -> FloatArray:
+        """Return what the sensors read along a trajectory, (n_samples, n_sensors)."""
+        read = path.at_samples(segment.forcing.sample_step)[:, self.network.sensor_node].copy()
+        for term in self.network.readings:
+            part = term.evaluate(segment.record.time_s, values[self.network.term_index(term)])
+            read[:, part.sensor] += part.offset_K
+        return read
+
+    def residuals(self, fit: Fit) -> list[FloatArray]:
+        """Return measured minus modelled per segment, (n_samples, n_sensors), NaN where missing."""
+        return [s.measured_K - p for s, p in zip(self.segments, fit.predicted_K, strict=True)]
+
+    def jacobian_blocks(self, unknowns: FloatArray, fit: Fit) -> list[FloatArray]:
+        """Return d predicted / d unknowns per segment: (n_samples, n_sensors, n_free + n_nodes).
+
+        The columns are the free parameters followed by this segment's own initial temperatures.
+        """
+        values = self.values(unknowns)
+        starts = np.hstack([np.zeros((self.n_nodes, self.n_free)), np.eye(self.n_nodes)])
+        blocks = []
+        for segment, path in zip(self.segments, fit.trajectories, strict=True):
+            parts = [
+                block
+                for _, block in sensitivities(
+                    self.network, values, segment.forcing, path, starts, self.n_free, self.network.sensor_node
+                )
+            ]
+            blocks.append(self._with_readings(values, segment, np.concatenate(parts)))
+        return blocks
+
+    def _with_readings(self, values: FloatArray, segment: Segment, block: FloatArray) -> FloatArray:
+        """Add the derivatives of sensor faults."""
+        parameters = self.network.parameters
+        position = {int(index): k for k, index in enumerate(parameters.free_index)}
+        at = parameters.at_values(values)
+        for term in self.network.readings:
+            index = self.network.term_index(term)
+            part = term.evaluate(segment.record.time_s, values[index])
+            for item, series in part.d_values:
+                if int(index[item]) in position:
+                    parameter = at.parameters[int(index[item])]
+                    slope = parameter.transform.slope(parameter.free)
+                    block[:, part.sensor, position[int(index[item])]] += slope * series
+        return block
+
+    def normal_equations(self, unknowns: FloatArray, fit: Fit) -> tuple[FloatArray, FloatArray]:
+        """Return the Gauss-Newton Hessian (n_unknowns, n_unknowns) and the gradient (n_unknowns,) of the cost."""
+        mean, std = self.prior()
+        hessian = np.diag(1.0 / std**2)
+        gradient = (unknowns - mean) / std**2
+        for i, (block, residual) in enumerate(zip(self.jacobian_blocks(unknowns, fit), self.residuals(fit), strict=True)):
+            valid = np.isfinite(residual)
+            weight = np.broadcast_to(1.0 / self.noise_K, residual.shape)[valid]
+            rows = block[valid] * weight[:, None]
+            columns = np.r_[0 : self.n_free, self.start_columns(i)]
+            hessian[np.ix_(columns, columns)] += rows.T @ rows
+            gradient[columns] -= rows.T @ (residual[valid] * weight)
+        return hessian, gradient
+
+    def with_network(self, network: Network) -> "Problem":
+        """Return the same data under another network (its effects may add states)."""
+        if network.nodes == self.network.nodes:
+            return replace(self, network=network)
+        segments = []
+        for segment in self.segments:
+            mean, std = _start_prior(network, segment.measured_K)
+            segments.append(replace(segment, start_prior_K=mean, start_std_K=std))
+        return Problem(network, tuple(segments), self.noise_K)
+
+
+def build_problem(
+    network: Network, records: Sequence[Record], noise_K: FloatArray, max_step_s: float = np.inf
+) -> Problem:
+    """Return the fitting problem of a network and its segments of telemetry.
+
+    Raises
+    ------
+    TelemetryError
+        If there is no record, or one of them cannot be used.
+    """
+    if not records:
+        raise TelemetryError("no telemetry given")
+    return Problem(network, tuple(build_segment(network, r, max_step_s) for r in records), noise_K)

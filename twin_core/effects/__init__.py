@@ -1,0 +1,1 @@
+"""One missing-physics effect per file, and the registry of them."""

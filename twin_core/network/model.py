@@ -1,0 +1,320 @@
+"""A network ready to be evaluated: the declared specification and any added effects as terms over one parameter set."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.errors import ModelError
+from twin_core.network.spec import Channel, Load, Quantity, TwinSpec, guess_or
+from twin_core.network.terms import (
+    BoundaryConductor,
+    CapacityTerm,
+    ChannelLoad,
+    Conductors,
+    ReadingTerm,
+    SinkRadiation,
+    TableLoad,
+    Term,
+)
+from twin_core.parameters.parameter import Parameter, positive, real
+from twin_core.parameters.vector import ParameterSet
+
+
+@dataclass(frozen=True)
+class ExtraNode:
+    """A state that an effect adds.
+
+    Attributes
+    ----------
+    name
+        Unique among the nodes.
+    capacity
+        Its capacity as a parameter.
+    like
+        The node whose initial temperature it starts from.
+    reads
+        The sensor that reads this state instead of its node; None for most.
+    """
+
+    name: str
+    capacity: Parameter
+    like: str
+    reads: str | None = None
+
+
+@dataclass(frozen=True)
+class Addition:
+    """What one effect adds to a network."""
+
+    terms: tuple[Term, ...] = ()
+    capacities: tuple[CapacityTerm, ...] = ()
+    readings: tuple[ReadingTerm, ...] = ()
+    nodes: tuple[ExtraNode, ...] = ()
+
+
+class Extension(Protocol):
+    """Anything that can extend a network: an effect."""
+
+    @property
+    def label(self) -> str:
+        """A name, unique in the model, that prefixes its parameters."""
+        ...
+
+    def extra_nodes(self, layout: "Layout") -> tuple[ExtraNode, ...]:
+        """Return the states that it adds."""
+        ...
+
+    def addition(self, layout: "Layout") -> Addition:
+        """Return its terms over the final layout."""
+        ...
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Names and positions in a network: all that an effect needs to know of it."""
+
+    spec: TwinSpec
+    nodes: tuple[str, ...]
+    boundaries: tuple[str, ...]
+    table_knots: Mapping[tuple[str, str], tuple[float, ...]]
+
+    def node(self, name: str) -> int:
+        """Return the position of a node; ModelError if there is none of that name."""
+        if name not in self.nodes:
+            raise ModelError(f"unknown node '{name}' (known: {', '.join(self.nodes)})")
+        return self.nodes.index(name)
+
+    def boundary(self, name: str) -> int:
+        """Return the position of a boundary; ModelError if there is none of that name."""
+        if name not in self.boundaries:
+            raise ModelError(f"unknown boundary '{name}' (known: {', '.join(self.boundaries)})")
+        return self.boundaries.index(name)
+
+    def sensor(self, name: str) -> int:
+        """Return the position of a sensor; ModelError if there is none of that name."""
+        if name not in self.spec.sensors:
+            raise ModelError(f"unknown sensor '{name}' (known: {', '.join(self.spec.sensors)})")
+        return self.spec.sensors.index(name)
+
+    def sensor_node(self, name: str) -> str:
+        """Return the node that a sensor reads."""
+        return next(node.id for node in self.spec.nodes if name in node.sensors)
+
+    @property
+    def declared_nodes(self) -> tuple[str, ...]:
+        """The nodes of the specification, without those that effects added."""
+        return tuple(node.id for node in self.spec.nodes)
+
+    @property
+    def node_pairs(self) -> set[frozenset[str]]:
+        """The pairs of nodes, or node and boundary, that a declared conductor joins."""
+        return {frozenset(c.between) for c in self.spec.conductors}
+
+    def loads_of(self, channel: str) -> tuple[Load, ...]:
+        """Return the declared loads that a channel drives."""
+        return tuple(load for load in self.spec.loads if load.channel == channel)
+
+
+def conductor_name(between: Sequence[str]) -> str:
+    """Return the name of a declared conductance, such as ``G:px|tank``."""
+    return f"G:{between[0]}|{between[1]}"
+
+
+def gain_name(load: Load) -> str:
+    """Return the name of the gain of a declared load, such as ``gain:H1|tank``."""
+    return f"gain:{load.channel}|{load.node}"
+
+
+def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -> Parameter:
+    """Return the parameter of a declared quantity; an undeclared one starts from ``default`` with a flat prior."""
+    value = guess_or(quantity, default)
+    known = quantity is not None and quantity.value is not None
+    declared = quantity is not None and quantity.guess is not None
+    bounds = None if quantity is None else quantity.bounds
+    prior = 3.0 if declared else 6.0
+    return positive(name, unit, value, bounds=bounds, prior_std=prior, frozen=known, guessed=not (known or declared))
+
+
+@dataclass(frozen=True)
+class Network:
+    """Declared terms and effects over one parameter set.
+
+    Attributes
+    ----------
+    layout
+        Names and positions of nodes (n_nodes) and boundaries (n_boundaries).
+    parameters
+        Every number of the model: capacities, conductances, gains, tables, unknown sinks, effects.
+    terms, capacities, readings
+        The heat balance, temperature-dependent capacity, and sensor faults.
+    sensor_node : (n_sensors,)
+        Position of the state that each sensor reads.
+    """
+
+    layout: Layout
+    parameters: ParameterSet
+    terms: tuple[Term, ...]
+    capacities: tuple[CapacityTerm, ...]
+    readings: tuple[ReadingTerm, ...]
+    sensor_node: IntArray
+    extra: tuple[ExtraNode, ...]
+
+    @property
+    def spec(self) -> TwinSpec:
+        """The declared specification."""
+        return self.layout.spec
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of all states."""
+        return self.layout.nodes
+
+    @cached_property
+    def capacity_index(self) -> IntArray:
+        """Position of each node's capacity among the parameters, (n_nodes,)."""
+        index = self.parameters.index
+        names = {node.name: node.capacity.name for node in self.extra}
+        return np.array([index[names.get(name, f"C:{name}")] for name in self.nodes], dtype=np.int64)
+
+    @cached_property
+    def boundary_index(self) -> IntArray:
+        """Position of each boundary's unknown temperature among the parameters, (n_boundaries,); -1 where given."""
+        index = self.parameters.index
+        return np.array([index.get(f"T:{name}", -1) for name in self.layout.boundaries], dtype=np.int64)
+
+    def term_index(self, term: Term | CapacityTerm | ReadingTerm) -> IntArray:
+        """Return the positions of a term's own and borrowed parameters."""
+        index = self.parameters.index
+        names = [p.name for p in term.parameters] + list(term.borrows)
+        return np.array([index[name] for name in names], dtype=np.int64)
+
+    @cached_property
+    def term_indices(self) -> tuple[IntArray, ...]:
+        """``term_index`` of every heat term."""
+        return tuple(self.term_index(term) for term in self.terms)
+
+    def with_values(self, values: FloatArray) -> "Network":
+        """Return the network at other parameter values, (n_parameters,)."""
+        return self.with_parameters(self.parameters.at_values(values))
+
+    def with_parameters(self, parameters: ParameterSet) -> "Network":
+        """Return the network with another parameter set over the same names."""
+        return Network(
+            self.layout, parameters, self.terms, self.capacities, self.readings, self.sensor_node, self.extra
+        )
+
+
+def build_network(
+    spec: TwinSpec,
+    effects: Iterable[Extension] = (),
+    *,
+    table_knots: Mapping[tuple[str, str], tuple[float, ...]] | None = None,
+    defaults: Mapping[str, float] | None = None,
+) -> Network:
+    """Return the network of a specification with effects added.
+
+    Parameters
+    ----------
+    spec
+        The declared network.
+    effects
+        Terms that the declared network lacks.
+    table_knots
+        (channel, node) -> knots of tables whose levels are read from telemetry.
+    defaults
+        Parameter name -> starting value of what nobody declared.
+
+    Raises
+    ------
+    ModelError
+        If an effect names a node, boundary, sensor or channel that the network lacks.
+    """
+    effects = tuple(effects)
+    knots = dict(table_knots or {})
+    bare = Layout(spec, tuple(node.id for node in spec.nodes), tuple(spec.boundaries), knots)
+    extra = tuple(node for effect in effects for node in effect.extra_nodes(bare))
+    layout = Layout(spec, bare.nodes + tuple(node.name for node in extra), bare.boundaries, knots)
+    additions = [effect.addition(layout) for effect in effects]
+    terms = (*_declared_terms(layout), *(t for a in additions for t in a.terms))
+    capacities = tuple(c for a in additions for c in a.capacities)
+    readings = tuple(r for a in additions for r in a.readings)
+    parameters: list[Parameter] = [
+        _quantity(f"C:{node.id}", "J/K", node.capacity_J_per_K, 1.0e4) for node in spec.nodes
+    ]
+    parameters += [
+        real(f"T:{name}", "K", b.guess_K, prior_std=50.0) for name, b in spec.boundaries.items() if b.guess_K is not None
+    ]
+    parameters += [node.capacity for node in extra]
+    parameters += [p for term in (*terms, *capacities, *readings) for p in term.parameters]
+    unique = tuple({p.name: p for p in parameters}.values())
+    reads = {node.reads: layout.node(node.name) for node in extra if node.reads is not None}
+    sensor_node = [reads.get(s, layout.node(layout.sensor_node(s))) for s in spec.sensors]
+    guessed = {p.name for p in unique if p.guessed}
+    start = {name: value for name, value in (defaults or {}).items() if name in guessed}
+    return Network(
+        layout,
+        ParameterSet(unique).updated(start),
+        terms,
+        capacities,
+        readings,
+        np.array(sensor_node, dtype=np.int64),
+        extra,
+    )
+
+
+def _declared_terms(layout: Layout) -> list[Term]:
+    """Return the terms of the specification."""
+    spec = layout.spec
+    terms: list[Term] = []
+    inner = [c for c in spec.conductors if not set(c.between) & set(layout.boundaries)]
+    if inner:
+        pairs = tuple((layout.node(c.between[0]), layout.node(c.between[1])) for c in inner)
+        conductances = tuple(_conductance(c.between, c.conductance_W_per_K) for c in inner)
+        terms.append(Conductors(pairs, conductances, len(layout.nodes)))
+    for conductor in spec.conductors:
+        outer = [end for end in conductor.between if end in layout.boundaries]
+        if outer:
+            node = next(end for end in conductor.between if end not in layout.boundaries)
+            parameter = _conductance(conductor.between, conductor.conductance_W_per_K)
+            terms.append(BoundaryConductor(layout.node(node), layout.boundary(outer[0]), (parameter,)))
+    for i, radiator in enumerate(spec.radiators):
+        area = radiator.emissivity * radiator.area_m2
+        name = f"R:{radiator.node}|{radiator.sink}" + (f"#{i}" if _repeated(spec, i) else "")
+        parameter = positive(name, "m2", area, frozen=True)
+        terms.append(SinkRadiation(layout.node(radiator.node), layout.boundary(radiator.sink), (parameter,)))
+    terms += [_load_term(layout, load) for load in spec.loads]
+    return terms
+
+
+def _repeated(spec: TwinSpec, i: int) -> bool:
+    """Return whether an earlier radiator joins the same node and sink."""
+    return any((r.node, r.sink) == (spec.radiators[i].node, spec.radiators[i].sink) for r in spec.radiators[:i])
+
+
+def _conductance(between: tuple[str, str], quantity: Quantity | None) -> Parameter:
+    return _quantity(conductor_name(between), "W/K", quantity, 1.0)
+
+
+def _load_term(layout: Layout, load: Load) -> Term:
+    """Return the term of one declared load; a gain is known (one) unless it is declared or the channel is in percent."""
+    channel: Channel = layout.spec.channels[load.channel]
+    node = layout.node(load.node)
+    if load.table is not None:
+        key = (load.channel, load.node)
+        knots = load.table.knots or layout.table_knots.get(key)
+        if knots is None:
+            raise ModelError(f"load '{load.channel}' on '{load.node}': the levels of its table are not known yet")
+        values = tuple(real(f"table:{load.channel}|{load.node}[{k:g}]", "W", 0.0) for k in knots)
+        return TableLoad(node, load.channel, tuple(knots), channel.levels, load.weight, load.solar, values)
+    unknown = load.gain is not None or channel.unit != "W"
+    unit = "W/%" if channel.unit == "percent" else ""
+    gain = (
+        _quantity(gain_name(load), unit, load.gain, 1.0) if unknown else positive(gain_name(load), unit, 1.0, frozen=True)
+    )
+    return ChannelLoad(node, load.channel, load.weight, load.solar, (gain,))
+
+

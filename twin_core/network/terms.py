@@ -1,0 +1,263 @@
+"""Terms of the heat balance: what flows into which node, and how it changes with temperature and parameters.
+
+Every term, declared or discovered, answers one question at many points at once: ``evaluate(along, values)`` returns the
+heat into the nodes that it touches together with exact derivatives. The time loop never calls a term; it sees arrays.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
+from twin_core.parameters.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class Along:
+    """The points at which a heat balance is evaluated.
+
+    Attributes
+    ----------
+    time_s : (n_points,)
+    temperatures_K : (n_points, n_nodes)
+    boundaries_K : (n_points, n_boundaries)
+    inputs : channel -> (n_points,)
+        Power in W (or percent), auxiliary channels in their own unit.
+    sun_factor : (n_points,)
+        (1 AU / Sun distance)^2; ones where no load is solar.
+    """
+
+    time_s: FloatArray
+    temperatures_K: FloatArray
+    boundaries_K: FloatArray
+    inputs: Mapping[str, FloatArray]
+    sun_factor: FloatArray
+
+
+class Entry(NamedTuple):
+    """A derivative series: of the quantity at ``node`` (its position in the network) with respect to item ``index``."""
+
+    index: int
+    node: int
+    series: FloatArray
+
+
+@dataclass(frozen=True)
+class Heat:
+    """Heat of one term and its derivatives.
+
+    Attributes
+    ----------
+    nodes : (n_local,)
+        The nodes that the term touches.
+    heat_W : (n_points, n_local)
+    d_temperature : (n_points or 1, n_local, n_local)
+        d heat_W[:, a] / d temperature of nodes[b].
+    d_values
+        Entries whose index counts the term's ``parameters`` first, then what it ``borrows``.
+    d_boundaries
+        Entries whose index is the boundary.
+    """
+
+    nodes: tuple[int, ...]
+    heat_W: FloatArray
+    d_temperature: FloatArray
+    d_values: list[Entry] = field(default_factory=list)
+    d_boundaries: list[Entry] = field(default_factory=list)
+
+
+class Term(Protocol):
+    """A heat flow. ``values`` are its own parameters followed by those it borrows from the network by name."""
+
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...]
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Return heat and derivatives at the given points."""
+        ...
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """Extra capacity of one node: (n_points,) in J/K, its slope in J/K^2, and parameter derivatives."""
+
+    node: int
+    extra_J_per_K: FloatArray
+    d_temperature: FloatArray
+    d_values: list[Entry]
+
+
+class CapacityTerm(Protocol):
+    """A temperature-dependent addition to the capacity of one node."""
+
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...]
+
+    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
+        """Return the extra capacity and derivatives at the given points."""
+        ...
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a sensor reads beyond the temperature of its node: (n_times,) in K, with derivatives (value index, series)."""
+
+    sensor: int
+    offset_K: FloatArray
+    d_values: list[tuple[int, FloatArray]]
+
+
+class ReadingTerm(Protocol):
+    """A fault of one sensor, as an offset over time."""
+
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...]
+
+    def evaluate(self, time_s: FloatArray, values: FloatArray) -> Reading:
+        """Return the offset and derivatives at the sample times."""
+        ...
+
+
+def pair_jacobian(d_first: FloatArray, d_second: FloatArray) -> FloatArray:
+    """Return (n_points, 2, 2) for an exchange q into the first node and -q into the second, from dq/dT of both."""
+    return np.stack([np.stack([d_first, d_second], -1), np.stack([-d_first, -d_second], -1)], axis=-2)
+
+
+@dataclass(frozen=True)
+class Conductors:
+    """All declared linear conductors between nodes at once: q_a = G (T_b - T_a), symmetric by construction."""
+
+    pairs: tuple[tuple[int, int], ...]
+    parameters: tuple[Parameter, ...]
+    n_nodes: int
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate every conductor; the Jacobian is the negative weighted graph Laplacian (paper A, eq. 1)."""
+        first, second = (list(side) for side in zip(*self.pairs, strict=True))
+        temperatures = along.temperatures_K
+        difference = temperatures[:, second] - temperatures[:, first]
+        incidence = np.zeros((len(self.pairs), self.n_nodes))
+        rows = np.arange(len(self.pairs))
+        incidence[rows, first], incidence[rows, second] = 1.0, -1.0
+        heat = (difference * values) @ incidence
+        laplacian = incidence.T @ (values[:, None] * incidence)
+        entries = []
+        for edge, (a, b) in enumerate(self.pairs):
+            entries += [Entry(edge, a, difference[:, edge]), Entry(edge, b, -difference[:, edge])]
+        return Heat(tuple(range(self.n_nodes)), heat, -laplacian[None], entries)
+
+
+@dataclass(frozen=True)
+class BoundaryConductor:
+    """A linear conductor from a node to a boundary: q = G (T_boundary - T)."""
+
+    node: int
+    boundary: int
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the conductor."""
+        conductance = values[0]
+        difference = along.boundaries_K[:, self.boundary] - along.temperatures_K[:, self.node]
+        flat = np.full(difference.shape, conductance)
+        return Heat(
+            (self.node,),
+            (conductance * difference)[:, None],
+            np.full((1, 1, 1), -conductance),
+            [Entry(0, self.node, difference)],
+            [Entry(self.boundary, self.node, flat)],
+        )
+
+
+@dataclass(frozen=True)
+class SinkRadiation:
+    """Radiation to a boundary: q = sigma R (T_s^4 - T^4), R = emissivity * area (paper A, section 2.3)."""
+
+    node: int
+    boundary: int
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the radiation."""
+        temperature = along.temperatures_K[:, self.node]
+        sink = along.boundaries_K[:, self.boundary]
+        unit = STEFAN_BOLTZMANN_W_PER_M2_K4 * (sink**4 - temperature**4)
+        slope = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * values[0]
+        return Heat(
+            (self.node,),
+            (values[0] * unit)[:, None],
+            (-slope * temperature**3)[:, None, None],
+            [Entry(0, self.node, unit)],
+            [Entry(self.boundary, self.node, slope * sink**3)],
+        )
+
+
+@dataclass(frozen=True)
+class ChannelLoad:
+    """A declared heat input: q = gain * weight * u(t), times (1 AU / Sun distance)^2 where solar."""
+
+    node: int
+    channel: str
+    weight: float
+    solar: bool
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def unit_heat(self, along: Along) -> FloatArray:
+        """Return the heat at gain one, (n_points,)."""
+        unit = self.weight * along.inputs[self.channel]
+        return unit * along.sun_factor if self.solar else unit
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the load."""
+        unit = self.unit_heat(along)
+        return Heat((self.node,), (values[0] * unit)[:, None], np.zeros((1, 1, 1)), [Entry(0, self.node, unit)])
+
+
+@dataclass(frozen=True)
+class TableLoad:
+    """Heat as a function of an auxiliary channel: hat functions over knots, or one value per level."""
+
+    node: int
+    channel: str
+    knots: tuple[float, ...]
+    levels: bool
+    weight: float
+    solar: bool
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the table; it is linear in its values."""
+        basis = self.weight * table_basis(along.inputs[self.channel], self.knots, self.levels)
+        if self.solar:
+            basis = basis * along.sun_factor[:, None]
+        entries = [Entry(i, self.node, basis[:, i]) for i in range(len(self.knots))]
+        return Heat((self.node,), (basis @ values)[:, None], np.zeros((1, 1, 1)), entries)
+
+
+def table_basis(x: FloatArray, knots: tuple[float, ...], levels: bool) -> FloatArray:
+    """Return the basis of a table, (n_points, n_knots): rows add to one.
+
+    Hat functions over the knots, constant beyond the ends; for levels the indicator of the nearest one.
+    """
+    points = np.asarray(knots, dtype=np.float64)
+    if levels:
+        nearest = np.argmin(np.abs(x[:, None] - points), axis=1)
+        return (nearest[:, None] == np.arange(points.size)).astype(np.float64)
+    basis = np.zeros((x.size, points.size))
+    if points.size == 1:
+        return np.ones_like(basis)
+    inside = np.clip(x, points[0], points[-1])
+    left = np.clip(np.searchsorted(points, inside, side="right") - 1, 0, points.size - 2)
+    share = (inside - points[left]) / (points[left + 1] - points[left])
+    rows = np.arange(x.size)
+    basis[rows, left] = 1.0 - share
+    basis[rows, left + 1] += share
+    return basis

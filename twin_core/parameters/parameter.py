@@ -1,0 +1,69 @@
+"""One parameter: its value, unit, transform and prior."""
+
+from dataclasses import dataclass, replace
+
+from twin_core.parameters.transforms import Identity, Log, LogInterval, Transform
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of the model.
+
+    Attributes
+    ----------
+    name
+        Unique within a model, such as ``C:px`` or ``G:px|tank``.
+    unit
+        SI unit, for people.
+    value
+        The current physical value (a guess, until calibrated).
+    transform
+        Maps the solver's unbounded number to the value.
+    prior_std
+        Standard deviation, in the transformed number, of a weak Gaussian prior around ``value``; None = flat.
+    frozen
+        True where the value is known and held.
+    guessed
+        True where nobody declared a value, so that the data alone must tell.
+    """
+
+    name: str
+    unit: str
+    value: float
+    transform: Transform = Log()
+    prior_std: float | None = None
+    frozen: bool = False
+    guessed: bool = False
+
+    @property
+    def free(self) -> float:
+        """The value in the solver's coordinate."""
+        return self.transform.to_free(self.value)
+
+    def at(self, value: float) -> "Parameter":
+        """Return the same parameter at another value."""
+        return replace(self, value=value)
+
+
+WEAK_LOG_STD = 3.0
+"""Prior of a guess in ln: a factor of 20 either way is one standard deviation, so data always win."""
+
+
+def positive(
+    name: str,
+    unit: str,
+    value: float,
+    *,
+    bounds: tuple[float, float] | None = None,
+    prior_std: float | None = WEAK_LOG_STD,
+    frozen: bool = False,
+    guessed: bool = False,
+) -> Parameter:
+    """Return a parameter that is positive (and within ``bounds``) by construction."""
+    transform: Transform = Log() if bounds is None else LogInterval(*bounds)
+    return Parameter(name, unit, value, transform, prior_std, frozen, guessed)
+
+
+def real(name: str, unit: str, value: float, *, prior_std: float | None = None, frozen: bool = False) -> Parameter:
+    """Return a parameter of either sign."""
+    return Parameter(name, unit, value, Identity(), prior_std, frozen)

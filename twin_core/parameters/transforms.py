@@ -1,0 +1,82 @@
+"""Bijections between a physical value and the unbounded number that a solver moves."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.special import expit
+
+
+class Transform(Protocol):
+    """A smooth, increasing map from the real line onto the admissible values."""
+
+    def to_value(self, free: float) -> float:
+        """Return the physical value."""
+        ...
+
+    def to_free(self, value: float) -> float:
+        """Return the unbounded number; inverse of ``to_value``."""
+        ...
+
+    def slope(self, free: float) -> float:
+        """Return d value / d free, positive."""
+        ...
+
+
+@dataclass(frozen=True)
+class Identity:
+    """value = free: a quantity of either sign."""
+
+    def to_value(self, free: float) -> float:
+        """Return the value itself."""
+        return free
+
+    def to_free(self, value: float) -> float:
+        """Return the value itself."""
+        return value
+
+    def slope(self, free: float) -> float:
+        """Return one."""
+        return 1.0
+
+
+@dataclass(frozen=True)
+class Log:
+    """value = exp(free): a positive quantity of unknown order of magnitude."""
+
+    def to_value(self, free: float) -> float:
+        """Return exp(free), held within e^-300 and e^300 so that a wild trial step stays a number."""
+        return float(np.exp(np.clip(free, -300.0, 300.0)))
+
+    def to_free(self, value: float) -> float:
+        """Return ln(value)."""
+        return float(np.log(value))
+
+    def slope(self, free: float) -> float:
+        """Return the value itself: d exp(x) / dx."""
+        return self.to_value(free)
+
+
+@dataclass(frozen=True)
+class LogInterval:
+    """A positive value strictly between two bounds: ln(value) runs along a logistic curve."""
+
+    lower: float
+    upper: float
+
+    def _span(self) -> float:
+        return float(np.log(self.upper / self.lower))
+
+    def to_value(self, free: float) -> float:
+        """Return lower * (upper / lower) ** logistic(free)."""
+        return float(self.lower * np.exp(self._span() * expit(free)))
+
+    def to_free(self, value: float) -> float:
+        """Return the logit of the position between the bounds; a value on a bound is moved just inside."""
+        position = float(np.clip(np.log(value / self.lower) / self._span(), 1e-6, 1.0 - 1e-6))
+        return float(np.log(position / (1.0 - position)))
+
+    def slope(self, free: float) -> float:
+        """Return d value / d free by the chain rule."""
+        position = float(expit(free))
+        return self.to_value(free) * self._span() * position * (1.0 - position)

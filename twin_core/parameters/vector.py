@@ -1,0 +1,93 @@
+"""A named set of parameters and the flat free vector that a solver sees."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.errors import ModelError
+from twin_core.parameters.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Parameters in a fixed order; the free ones form the solver's vector (n_free,)."""
+
+    parameters: tuple[Parameter, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse two parameters of one name."""
+        names = [p.name for p in self.parameters]
+        for i, name in enumerate(names):
+            if name in names[:i]:
+                raise ModelError(f"parameter '{name}' stands twice in the model")
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @cached_property
+    def index(self) -> dict[str, int]:
+        """Position of each name."""
+        return {p.name: i for i, p in enumerate(self.parameters)}
+
+    @cached_property
+    def free_index(self) -> IntArray:
+        """Positions of the parameters that are not frozen, (n_free,)."""
+        return np.array([i for i, p in enumerate(self.parameters) if not p.frozen], dtype=np.int64)
+
+    @property
+    def free_names(self) -> tuple[str, ...]:
+        """Names of the free parameters, in the order of the free vector."""
+        return tuple(self.parameters[i].name for i in self.free_index)
+
+    @property
+    def values(self) -> FloatArray:
+        """Physical values, (n_parameters,)."""
+        return np.array([p.value for p in self.parameters], dtype=np.float64)
+
+    @property
+    def free(self) -> FloatArray:
+        """The free vector at the current values, (n_free,)."""
+        return np.array([self.parameters[i].free for i in self.free_index], dtype=np.float64)
+
+    @cached_property
+    def prior_std(self) -> FloatArray:
+        """Prior standard deviations of the free vector, (n_free,); infinite where flat."""
+        stds = [self.parameters[i].prior_std for i in self.free_index]
+        return np.array([np.inf if s is None else s for s in stds], dtype=np.float64)
+
+    def to_values(self, free: FloatArray) -> FloatArray:
+        """Return all physical values, (n_parameters,), for a free vector (n_free,)."""
+        values = self.values
+        for position, i in enumerate(self.free_index):
+            values[i] = self.parameters[i].transform.to_value(float(free[position]))
+        return values
+
+    def slopes(self, free: FloatArray) -> FloatArray:
+        """Return d value / d free of each free parameter, (n_free,)."""
+        return np.array(
+            [self.parameters[i].transform.slope(float(x)) for i, x in zip(self.free_index, free, strict=True)],
+            dtype=np.float64,
+        )
+
+    def at_free(self, free: FloatArray) -> "ParameterSet":
+        """Return the set with the values of a free vector."""
+        return self.at_values(self.to_values(free))
+
+    def at_values(self, values: FloatArray) -> "ParameterSet":
+        """Return the set with other physical values, (n_parameters,)."""
+        return ParameterSet(tuple(p.at(float(v)) for p, v in zip(self.parameters, values, strict=True)))
+
+    def updated(self, values: Mapping[str, float]) -> "ParameterSet":
+        """Return the set with the named values replaced; names that it lacks are ignored."""
+        return ParameterSet(tuple(p.at(float(values.get(p.name, p.value))) for p in self.parameters))
+
+    def joined(self, more: Iterable[Parameter]) -> "ParameterSet":
+        """Return the set with more parameters at its end."""
+        return ParameterSet(self.parameters + tuple(more))
+
+    def as_dict(self) -> dict[str, float]:
+        """Return name -> physical value."""
+        return {p.name: p.value for p in self.parameters}

@@ -1,0 +1,136 @@
+"""Telemetry as forcing: the time steps of a rollout with inputs and boundary temperatures at every stage."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.errors import TelemetryError
+from twin_core.network.model import Network
+from twin_core.network.spec import TwinSpec
+from twin_core.network.terms import Along
+from twin_core.simulate.kernels import GAMMA
+from twin_core.telemetry import Record
+from twin_core.units import sun_distance_au
+
+
+@dataclass(frozen=True)
+class Forcing:
+    """What drives a rollout.
+
+    Attributes
+    ----------
+    start_s
+        Time of the initial state.
+    step_s : (n_steps,)
+    stage_time_s : (n_steps, 2)
+    sample_step : (n_samples,)
+        Steps taken before each sample.
+    boundaries_K : (n_steps, 2, n_boundaries)
+        NaN where the temperature is an unknown constant.
+    inputs : channel -> (n_steps, 2)
+    sun_factor : (n_steps, 2)
+    """
+
+    start_s: float
+    step_s: FloatArray
+    stage_time_s: FloatArray
+    sample_step: IntArray
+    boundaries_K: FloatArray
+    inputs: Mapping[str, FloatArray]
+    sun_factor: FloatArray
+
+    @property
+    def n_steps(self) -> int:
+        """Number of time steps."""
+        return int(self.step_s.size)
+
+    def along(self, temperatures_K: FloatArray, boundaries_K: FloatArray, first: int, last: int) -> Along:
+        """Return the stage points of steps first..last-1 flattened to (2 n_steps, ...), at given temperatures."""
+        window = slice(first, last)
+        return Along(
+            self.stage_time_s[window].ravel(),
+            temperatures_K,
+            boundaries_K,
+            {name: series[window].ravel() for name, series in self.inputs.items()},
+            self.sun_factor[window].ravel(),
+        )
+
+
+def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *, interval: FloatArray) -> FloatArray:
+    """Return a channel at the stages: the sample that opens their interval where held, else interpolated.
+
+    Missing samples hold the last one (or are bridged by interpolation); before the first sample its value is taken.
+    """
+    column = record.channel(channel)
+    valid = np.isfinite(column)
+    if not valid.any():
+        raise TelemetryError(f"{record.name}: channel '{channel}' has no samples; the model needs it as an input")
+    if not is_held:
+        return np.interp(time_s, record.time_s[valid], column[valid])
+    last = np.maximum.accumulate(np.where(valid, np.arange(column.size), -1))
+    filled = column[np.where(last >= 0, last, np.argmax(valid))]
+    return filled[interval]
+
+
+def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcing:
+    """Return the forcing of a record: every sample is a step's end, long intervals are divided.
+
+    Parameters
+    ----------
+    network
+        Declares boundaries, inputs and whether the Sun's distance matters.
+    record
+        Telemetry in SI.
+    max_step_s
+        Longest step allowed.
+
+    Raises
+    ------
+    TelemetryError
+        If a channel that drives the network is missing or empty, or a solar load meets a record without dates.
+    """
+    spec = network.spec
+    intervals = np.diff(record.time_s)
+    divisions = np.maximum(1, np.ceil(intervals / max_step_s - 1e-9)).astype(np.int64)
+    step = np.repeat(intervals / divisions, divisions)
+    interval = np.repeat(np.arange(intervals.size), divisions)
+    within = np.arange(step.size) - np.repeat(np.cumsum(divisions) - divisions, divisions)
+    begin = record.time_s[interval] + within * step
+    stage_time = begin[:, None] + step[:, None] * np.array([GAMMA, 1.0])
+    stage_interval = np.repeat(interval[:, None], 2, axis=1)
+    boundaries = np.full((step.size, 2, len(spec.boundaries)), np.nan)
+    for column, boundary in enumerate(spec.boundaries.values()):
+        if boundary.value_K is not None:
+            boundaries[:, :, column] = boundary.value_K
+        elif boundary.channel is not None:
+            held = spec.channels[boundary.channel].is_held
+            boundaries[:, :, column] = at_times(record, boundary.channel, held, stage_time, interval=stage_interval)
+    inputs = {
+        name: at_times(record, name, spec.channels[name].is_held, stage_time, interval=stage_interval)
+        for name in _driving_channels(spec, record)
+    }
+    sample_step = np.concatenate([[0], np.cumsum(divisions)])
+    sun = _sun_factor(spec, record, stage_time)
+    return Forcing(float(record.time_s[0]), step, stage_time, sample_step, boundaries, inputs, sun)
+
+
+def _driving_channels(spec: TwinSpec, record: Record) -> tuple[str, ...]:
+    """Return the channels of declared loads, and every further power or auxiliary channel that the record has."""
+    declared = {load.channel for load in spec.loads}
+    free = {
+        name
+        for name, channel in spec.channels.items()
+        if channel.kind != "temperature" and name in record.values and np.isfinite(record.values[name]).any()
+    }
+    return tuple(name for name in spec.channels if name in declared | free)
+
+
+def _sun_factor(spec: TwinSpec, record: Record, time_s: FloatArray) -> FloatArray:
+    """Return (1 AU / Sun distance)^2 at the stages; ones where nothing is solar."""
+    if not any(load.solar for load in spec.loads):
+        return np.ones_like(time_s)
+    if record.epoch_ns is None:
+        raise TelemetryError(f"{record.name}: a solar load needs dates; give a 'time' column in RFC 3339, not 'time_s'")
+    return 1.0 / sun_distance_au(record.epoch_ns, time_s) ** 2
