@@ -1,1 +1,57 @@
-"""Calibration: fitting a declared network to measured temperatures."""
+"""Calibration: fitting a declared network to measured temperatures.
+
+The methods are looked up when asked for, so that reading a model file needs no compiler and no torch.
+"""
+
+from collections.abc import Sequence
+
+from twin_core._typing import Progress, no_progress
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.errors import ModelError
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+METHODS = ("second-order",)
+
+
+def calibrate(
+    spec: TwinSpec,
+    records: Sequence[Record],
+    *,
+    method: str = "second-order",
+    progress: Progress = no_progress,
+) -> CalibratedModel:
+    """Calibrate a declared network against telemetry.
+
+    Parameters
+    ----------
+    spec
+        The declared network: guesses, bounds, known values.
+    records
+        Segments of telemetry in SI, each with its own initial state.
+    method
+        ``second-order``: Levenberg-Marquardt with exact sensitivities.
+    progress
+        Called with the fraction done and a message.
+
+    Returns
+    -------
+    CalibratedModel
+        With covariance, residual figures and plain words about what the data cannot see.
+
+    Raises
+    ------
+    TelemetryError, ModelError
+        If the telemetry lacks what the model needs, or the balance has no solution.
+    """
+    if method not in METHODS:
+        raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
+    from twin_core.calibrate.second_order import fit_network, to_model
+
+    calibration = fit_network(spec, records, progress=progress)
+    model = to_model(calibration, ())
+    progress(1.0, "calibrated")
+    return model
+
+
+__all__ = ["METHODS", "CalibratedModel", "calibrate"]

@@ -1,1 +1,58 @@
-"""One missing-physics effect per file, and the registry of them."""
+"""The registry of effects: one missing-physics term per file, one line here."""
+
+from typing import Any
+
+from twin_core.effects.base import Effect, Quality, Survey, Where, require
+from twin_core.effects.base import to_json as effect_to_json
+from twin_core.effects.channel_heat_load import ChannelHeatLoad
+from twin_core.effects.constant_heat_load import ConstantHeatLoad
+from twin_core.effects.hidden_mass import HiddenMass
+from twin_core.effects.input_gain import InputGain
+from twin_core.effects.input_power_law import InputPowerLaw
+from twin_core.effects.leak_to_boundary import LeakToBoundary
+from twin_core.effects.learned_heat_flow import LearnedHeatFlow
+from twin_core.effects.missing_conductor import MissingConductor
+from twin_core.effects.proportional_heater import ProportionalHeater
+from twin_core.effects.radiation_to_sink import RadiationToSink
+from twin_core.errors import SpecError
+
+REGISTRY: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        RadiationToSink,
+        MissingConductor,
+        LeakToBoundary,
+        ConstantHeatLoad,
+        ChannelHeatLoad,
+        ProportionalHeater,
+        InputGain,
+        InputPowerLaw,
+        HiddenMass,
+        LearnedHeatFlow,
+    )
+}
+
+
+def effect_from_json(data: Any, position: int = 0) -> Effect:
+    """Return the effect that ``effect_to_json`` wrote.
+
+    Raises
+    ------
+    SpecError
+        Naming the field that is missing or wrong.
+    """
+    field = f"effects[{position}]"
+    if not isinstance(data, dict) or data.get("effect") not in REGISTRY:
+        name = data.get("effect") if isinstance(data, dict) else data
+        raise SpecError(f"{field}.effect: unknown effect {name!r} (known: {', '.join(REGISTRY)})")
+    kind = REGISTRY[data["effect"]]
+    require(data.get("where", {}), kind.keys, kind.name)
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in data.get("settings", {}).items()}
+    effect = kind(dict(data["where"]), {k: float(v) for k, v in data.get("values", {}).items()}, settings)
+    lacking = [q.name for q in effect.qualities() if q.name not in effect.values]
+    if lacking:
+        raise SpecError(f"{field}.values.{lacking[0]}: is missing")
+    return effect
+
+
+__all__ = ["REGISTRY", "Effect", "Quality", "Survey", "Where", "effect_from_json", "effect_to_json"]

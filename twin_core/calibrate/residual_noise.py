@@ -1,0 +1,75 @@
+"""The noise of the real residual: what a model leaves is coloured, and evidence must be weighed in that metric."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.problem import Problem
+from twin_core.gp.noise_model import ResidualNoise, fit, whiten
+
+SEPARATION = 1.0e3
+"""Segments are laid this many record lengths apart, so that their residuals are independent."""
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """One residual noise model per sensor, over all segments of a problem.
+
+    Attributes
+    ----------
+    time_s : (n_rows,)
+        Sample times of all segments on one axis, far apart from each other.
+    valid : (n_rows, n_sensors)
+    models
+        One per sensor: white noise plus an Ornstein-Uhlenbeck misfit.
+    """
+
+    time_s: FloatArray
+    valid: np.ndarray
+    models: tuple[ResidualNoise, ...]
+
+    @property
+    def log_likelihood(self) -> float:
+        """Log-likelihood of the residuals under the fitted noise, all sensors."""
+        return float(sum(model.log_likelihood for model in self.models))
+
+    def whiten(self, columns: FloatArray) -> FloatArray:
+        """Return whitened columns, (n_valid, n_columns), from (n_rows, n_sensors, n_columns)."""
+        parts = []
+        for s, model in enumerate(self.models):
+            whitened, _ = whiten(model, self.time_s, np.ascontiguousarray(columns[:, s]), self.valid[:, s])
+            parts.append(whitened[self.valid[:, s]])
+        return np.concatenate(parts)
+
+
+def one_axis(problem: Problem) -> FloatArray:
+    """Return the sample times of all segments, (n_rows,), on one increasing axis with wide gaps between segments."""
+    spans = [s.record.time_s - s.record.time_s[0] for s in problem.segments]
+    gap = SEPARATION * max(float(t[-1]) for t in spans)
+    return np.concatenate([t + i * gap for i, t in enumerate(spans)])
+
+
+def fit_whitener(problem: Problem, residuals: Sequence[FloatArray]) -> Whitener:
+    """Return the noise models of the residuals of a problem, (n_samples, n_sensors) per segment.
+
+    Quantisation and the sensors' white noise are a floor: a residual cannot be whiter than its sensor.
+    """
+    time_s, stacked = one_axis(problem), np.concatenate(list(residuals))
+    models = tuple(
+        fit(time_s, stacked[:, s], white_floor=0.7 * float(problem.noise_K[s])) for s in range(stacked.shape[1])
+    )
+    return Whitener(time_s, np.isfinite(stacked), models)
+
+
+def stacked_jacobian(problem: Problem, blocks: Sequence[FloatArray]) -> FloatArray:
+    """Return d predicted / d unknowns of all segments, (n_rows, n_sensors, n_unknowns)."""
+    rows = [block.shape[0] for block in blocks]
+    full = np.zeros((sum(rows), blocks[0].shape[1], problem.n_unknowns))
+    first = 0
+    for i, block in enumerate(blocks):
+        full[first : first + rows[i], :, : problem.n_free] = block[:, :, : problem.n_free]
+        full[first : first + rows[i], :, problem.start_columns(i)] = block[:, :, problem.n_free :]
+        first += rows[i]
+    return full

@@ -1,0 +1,132 @@
+"""The calibrated model: numbers with their uncertainty, plain words about what the data cannot see, a JSON form."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from twin_core import __version__
+from twin_core._typing import FloatArray, Json
+from twin_core.effects import effect_from_json, effect_to_json
+from twin_core.effects.base import Effect
+from twin_core.errors import ModelError, SpecError
+from twin_core.network.model import Network, build_network
+from twin_core.network.spec import TwinSpec, dump_spec, load_spec
+
+FORMAT = "thermal-twin-model/1"
+
+
+@dataclass(frozen=True)
+class CalibratedModel:
+    """A network at its calibrated values.
+
+    Attributes
+    ----------
+    spec
+        What the operator declared.
+    effects
+        Terms that were found to be missing, as effects with their values.
+    values
+        Parameter name -> physical value, effects included.
+    covariance : (n_free, n_free)
+        Of the free parameters in the solver's coordinate (ln for positive ones), in the order of ``free_names``.
+    free_names
+        Names of the calibrated parameters.
+    noise_K
+        Sensor -> white noise standard deviation.
+    misfit_K, misfit_length_s
+        Sensor -> standard deviation and correlation length of what the model leaves beyond the noise.
+    max_step_s
+        Longest time step of its rollouts.
+    table_knots
+        (channel, node) -> levels read from telemetry.
+    summary
+        Train span, errors, notices, parameters with standard deviations.
+    """
+
+    spec: TwinSpec
+    effects: tuple[Effect, ...]
+    values: dict[str, float]
+    covariance: FloatArray
+    free_names: tuple[str, ...]
+    noise_K: dict[str, float]
+    misfit_K: dict[str, float]
+    misfit_length_s: dict[str, float]
+    max_step_s: float
+    table_knots: dict[tuple[str, str], tuple[float, ...]] = field(default_factory=dict)
+    summary: Json = field(default_factory=dict)
+
+    def network(self) -> Network:
+        """Return the network at the calibrated values."""
+        network = build_network(self.spec, self.effects, table_knots=self.table_knots)
+        return network.with_parameters(network.parameters.updated(self.values))
+
+    def noise_vector_K(self) -> FloatArray:
+        """Return the noise of the sensors, (n_sensors,)."""
+        return np.array([self.noise_K[s] for s in self.spec.sensors])
+
+    def to_json(self) -> Json:
+        """Return the model as plain JSON data that ``from_json`` reads back."""
+        return {
+            "format": FORMAT,
+            "code_version": __version__,
+            "spec": dump_spec(self.spec),
+            "effects": [effect_to_json(effect) for effect in self.effects],
+            "values": self.values,
+            "free_names": list(self.free_names),
+            "covariance": self.covariance.tolist(),
+            "noise_K": self.noise_K,
+            "misfit_K": self.misfit_K,
+            "misfit_length_s": self.misfit_length_s,
+            "max_step_s": self.max_step_s,
+            "table_knots": [{"channel": c, "node": n, "knots": list(k)} for (c, n), k in self.table_knots.items()],
+            "summary": self.summary,
+        }
+
+    @classmethod
+    def from_json(cls, data: Any) -> "CalibratedModel":
+        """Return the model of a JSON file.
+
+        Raises
+        ------
+        SpecError
+            Naming the field that is missing or wrong.
+        """
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise SpecError(f"format: not a model file of this program (expected '{FORMAT}'); make one with twin calibrate")
+        try:
+            spec = load_spec(data["spec"])
+            free_names = tuple(str(name) for name in data["free_names"])
+            covariance = np.array(data["covariance"], dtype=np.float64).reshape(len(free_names), len(free_names))
+            model = cls(
+                spec,
+                tuple(effect_from_json(item, i) for i, item in enumerate(data["effects"])),
+                {str(name): float(value) for name, value in data["values"].items()},
+                covariance,
+                free_names,
+                {s: float(data["noise_K"][s]) for s in spec.sensors},
+                {s: float(data["misfit_K"][s]) for s in spec.sensors},
+                {s: float(data["misfit_length_s"][s]) for s in spec.sensors},
+                float(data["max_step_s"]),
+                {(t["channel"], t["node"]): tuple(map(float, t["knots"])) for t in data["table_knots"]},
+                dict(data["summary"]),
+            )
+        except KeyError as error:
+            raise SpecError(f"{error.args[0]}: is missing from the model file") from error
+        except (TypeError, ValueError, AttributeError) as error:
+            raise SpecError(f"the model file is damaged: {error}") from error
+        model._check()
+        return model
+
+    def _check(self) -> None:
+        """Refuse a model whose values do not fit its network."""
+        try:
+            names = self.network().parameters.index
+        except ModelError as error:
+            raise SpecError(f"effects: {error}") from error
+        lacking = [name for name in names if name not in self.values]
+        if lacking:
+            raise SpecError(f"values.{lacking[0]}: is missing from the model file")
+        wrong = [name for name, value in self.values.items() if not np.isfinite(value)]
+        if wrong:
+            raise SpecError(f"values.{wrong[0]}: is not a finite number")

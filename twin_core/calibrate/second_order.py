@@ -1,0 +1,216 @@
+"""The default calibration: trajectory matching by a second-order solver with exact sensitivities."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import FloatArray, Json, Progress, no_progress
+from twin_core.calibrate.identifiability import words
+from twin_core.calibrate.noise import sensor_noise_K
+from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
+from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.calibrate.residual_noise import Whitener, fit_whitener, stacked_jacobian
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.calibrate.starting import balance_start, table_levels
+from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.effects.base import Effect
+from twin_core.errors import ModelError
+from twin_core.network.model import Network, build_network
+from twin_core.network.spec import TwinSpec
+from twin_core.simulate.rollout import rollout
+from twin_core.telemetry import Record
+
+STEP_ERROR_SHARE = 0.1
+"""Time steps are halved until halving changes no reading by more than this share of the noise."""
+
+MAX_HALVINGS = 3
+N_STARTS = 4
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A fitted network: the problem, where the search ended, and the noise of what is left."""
+
+    problem: Problem
+    optimum: Optimum
+    whitener: Whitener
+    max_step_s: float
+
+    @property
+    def network(self) -> Network:
+        """The network at its calibrated values."""
+        return self.problem.network.with_values(self.problem.values(self.optimum.unknowns))
+
+    @property
+    def residuals(self) -> list[FloatArray]:
+        """Measured minus modelled per segment."""
+        return self.problem.residuals(self.optimum.fit)
+
+
+def sampling_step_s(records: Sequence[Record]) -> float:
+    """Return the median sampling interval of all records."""
+    return float(np.median(np.concatenate([np.diff(r.time_s) for r in records if r.time_s.size > 1] or [np.ones(1)])))
+
+
+def fit_network(
+    spec: TwinSpec,
+    records: Sequence[Record],
+    effects: Sequence[Effect] = (),
+    *,
+    progress: Progress = no_progress,
+) -> Calibration:
+    """Calibrate a declared network, with effects if any, against telemetry.
+
+    Parameters
+    ----------
+    spec
+        The declared network.
+    records
+        Segments of telemetry in SI, each with its own initial state.
+    effects
+        Terms beyond the declaration, at their starting values.
+
+    Returns
+    -------
+    Calibration
+
+    Raises
+    ------
+    TelemetryError
+        If telemetry lacks a channel that the model needs, or has too few samples.
+    ModelError
+        If the heat balance has no solution at the guesses.
+    """
+    progress(0.0, "reading noise and levels")
+    noise = sensor_noise_K(spec, list(records))
+    network = build_network(spec, effects, table_knots=table_levels(spec, records))
+    step = 1.5 * sampling_step_s(records)
+    problem = build_problem(network, records, noise, step)
+    progress(0.05, "calibrating")
+    optimum = _best_start(problem, progress)
+    for halving in range(MAX_HALVINGS):
+        finer = build_problem(problem.network, records, noise, step / 2.0 / 1.5)
+        if _step_error(problem, finer, optimum) < STEP_ERROR_SHARE:
+            break
+        step, problem = step / 2.0, finer
+        progress(0.7 + 0.1 * halving, "refining the time step")
+        optimum = minimise(problem, optimum.unknowns)
+    if optimum.status == "no_solution":
+        raise ModelError(f"calibration failed: {ADVICE[optimum.status]}")
+    progress(0.95, "weighing what is left")
+    return Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
+
+
+def _step_error(problem: Problem, finer: Problem, optimum: Optimum) -> float:
+    """Return the largest change of a reading, in units of its noise, when the time step is halved."""
+    values = problem.values(optimum.unknowns)
+    worst = 0.0
+    for i, (segment, path) in enumerate(zip(finer.segments, optimum.fit.trajectories, strict=True)):
+        start = optimum.unknowns[problem.start_columns(i)]
+        fine = rollout(problem.network, values, start, segment.forcing)
+        if not (fine.converged and path.converged):
+            continue
+        coarse = path.at_samples(problem.segments[i].forcing.sample_step)
+        change = np.abs(coarse - fine.at_samples(segment.forcing.sample_step))[:, problem.network.sensor_node]
+        worst = max(worst, float((change / problem.noise_K).max()))
+    return worst
+
+
+def _best_start(problem: Problem, progress: Progress) -> Optimum:
+    """Return the best optimum from the declared guesses, and from scattered ones where guesses are missing."""
+    start = balance_start(problem)
+    unknowns = problem.start()
+    unknowns[: problem.n_free] = start.free
+    best = minimise(problem.with_network(problem.network.with_parameters(start)), unknowns)
+    guessed = np.array([start.parameters[i].guessed for i in start.free_index], dtype=np.bool_)
+    if not guessed.any():
+        return best
+    generator = np.random.default_rng(0)
+    for trial in range(1, N_STARTS):
+        progress(0.1 + 0.15 * trial, "calibrating from other starting points")
+        scattered = unknowns.copy()
+        scattered[: problem.n_free][guessed] += generator.normal(0.0, 1.0, int(guessed.sum()))
+        other = minimise(problem.with_network(problem.network.with_parameters(start)), scattered, max_iterations=40)
+        if other.fit.cost < best.fit.cost:
+            best = other
+    return best
+
+
+def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
+    """Return the covariance of the unknowns, (n_unknowns, n_unknowns), in the metric of the coloured residual."""
+    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
+    whitened = whitener.whiten(jacobian)
+    _, std = problem.prior()
+    hessian = whitened.T @ whitened + np.diag(1.0 / std**2)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
+
+
+def to_model(calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = ()) -> CalibratedModel:
+    """Return the calibrated model of a fit, with uncertainty and plain words."""
+    problem, optimum = calibration.problem, calibration.optimum
+    network, spec = calibration.network, calibration.network.spec
+    covariance = gls_covariance(problem, optimum, calibration.whitener)
+    free = covariance[: problem.n_free, : problem.n_free]
+    values = network.parameters.as_dict()
+    misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
+    return CalibratedModel(
+        spec,
+        tuple(effect.at_parameters(values) for effect in effects),
+        values,
+        free,
+        network.parameters.free_names,
+        {s: float(n) for s, n in zip(spec.sensors, problem.noise_K, strict=True)},
+        {s: float(m.sigma_ou) for s, m in misfit.items()},
+        {s: float(m.length_s) for s, m in misfit.items()},
+        calibration.max_step_s,
+        dict(network.layout.table_knots),
+        _summary(calibration, free, notices),
+    )
+
+
+def _summary(calibration: Calibration, covariance: FloatArray, notices: Sequence[str]) -> Json:
+    """Return the plain figures of a fit for people and JSON."""
+    problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
+    slopes = network.parameters.slopes(network.parameters.free)
+    stds = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * slopes
+    by_name = dict(zip(network.parameters.free_names, stds.tolist(), strict=True))
+    fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
+    first, last = problem.segments[0].record, problem.segments[-1].record
+    heard = [n for s in problem.segments for n in s.record.notices]
+    return {
+        "train": {
+            "start": first.present(first.time_s[0]),
+            "stop": last.present(last.time_s[-1]),
+            "samples": int(sum(s.valid.any(axis=1).sum() for s in problem.segments)),
+            "segments": len(problem.segments),
+        },
+        "status": optimum.status,
+        "advice": ADVICE[optimum.status],
+        "iterations": optimum.iterations,
+        **fit,
+        "residual_whiteness": residual_whiteness(calibration.residuals),
+        "criteria": acceptance(network.spec, fit["per_sensor"]),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "mean": p.value, "std": by_name.get(p.name), "held": p.frozen}
+            for p in network.parameters.parameters
+        ],
+        "words": words(network.parameters, covariance),
+        "notices": list(dict.fromkeys([*notices, *heard])),
+    }
+
+
+def acceptance(spec: TwinSpec, per_sensor: Json) -> Json:
+    """Return the correlation acceptance: worst bias and worst 99 % error over the sensors, and whether both are met."""
+    bias = max((abs(row["bias_K"]) for row in per_sensor.values()), default=0.0)
+    spread = max((row["q99_abs_K"] for row in per_sensor.values()), default=0.0)
+    limits = spec.criteria
+    met = bias <= limits.bias_K and spread <= limits.q99_abs_K
+    return {
+        "bias_K": bias,
+        "q99_abs_K": spread,
+        "limit_bias_K": limits.bias_K,
+        "limit_q99_abs_K": limits.q99_abs_K,
+        "met": bool(met),
+    }

@@ -1,0 +1,218 @@
+"""What an effect is: a named term that a declared network may lack, with its parameters, places and starting points.
+
+Adding one is one file with a subclass, and one line in the registry of ``twin_core.effects``. Nothing else knows its name.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray, Json
+from twin_core.errors import ModelError
+from twin_core.network.model import Addition, ExtraNode, Layout
+from twin_core.network.terms import Along
+from twin_core.parameters.parameter import Parameter
+from twin_core.parameters.transforms import Identity, Log
+
+Where = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """One parameter of an effect.
+
+    Attributes
+    ----------
+    name, unit
+        As the report writes them.
+    null
+        The value at which the effect vanishes; None for a parameter that shapes it without scaling it.
+    positive
+        Whether the value must stay positive.
+    prior_std
+        Weak prior around the starting value, in ln for positive ones; None = flat.
+    """
+
+    name: str
+    unit: str
+    null: float | None = None
+    positive: bool = False
+    prior_std: float | None = None
+
+
+@dataclass(frozen=True)
+class Survey:
+    """The training record as a candidate sees it: the declared model's own trajectory and inputs.
+
+    Attributes
+    ----------
+    layout
+        Names and positions.
+    along
+        Stage points of all segments one after the other.
+    rate_K_per_s : (n_points, n_nodes)
+        Rates of the declared model there.
+    capacity_J_per_K : (n_nodes,)
+        Calibrated capacities.
+    channel_levels
+        Auxiliary channel -> resting values, for those declared with levels.
+    segment_edges
+        Positions in the points where segments begin, and the end.
+    """
+
+    layout: Layout
+    along: Along
+    rate_K_per_s: FloatArray
+    capacity_J_per_K: FloatArray
+    channel_levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    segment_edges: tuple[int, ...] = ()
+
+    def temperature_K(self, node: str) -> FloatArray:
+        """Return a node's temperature along the record, (n_points,)."""
+        return self.along.temperatures_K[:, self.layout.node(node)]
+
+    def segments(self) -> Iterable[slice]:
+        """Yield the points of each segment."""
+        yield from (slice(a, b) for a, b in zip(self.segment_edges[:-1], self.segment_edges[1:], strict=True))
+
+
+@dataclass(frozen=True)
+class Effect(ABC):
+    """A missing-physics term at a place, with values.
+
+    Attributes
+    ----------
+    where
+        Contract keys: node, nodes (a pair), sink, boundary, channel, sensor.
+    values
+        Parameter name -> value; tables are numbered, ``values_W[0]``.
+    settings
+        What is not calibrated: knots, a degree, a reference.
+    """
+
+    where: Where
+    values: Mapping[str, float]
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    name: ClassVar[str]
+    keys: ClassVar[tuple[str, ...]]
+    equation: ClassVar[str]
+    reference: ClassVar[str]
+    words: ClassVar[str]
+
+    @abstractmethod
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return the parameters, in order."""
+
+    @abstractmethod
+    def addition(self, layout: Layout) -> Addition:
+        """Return the terms over a layout; ModelError if a name of ``where`` does not exist."""
+
+    @classmethod
+    @abstractmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every place of a network where the effect could act and the declared model does not have it."""
+
+    @classmethod
+    @abstractmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield the effect at its null amplitude for a grid of its nonlinear settings."""
+
+    def extra_nodes(self, layout: Layout) -> tuple[ExtraNode, ...]:
+        """Return the states that the effect adds; none for most."""
+        return ()
+
+    @property
+    def label(self) -> str:
+        """Name and place, unique in a model: ``radiation_to_sink(px,space)``."""
+        places = [p for v in self.where.values() for p in ((v,) if isinstance(v, str) else v)]
+        return f"{self.name}({','.join(places)})"
+
+    @property
+    def place(self) -> tuple[str, frozenset[tuple[str, Any]]]:
+        """Name and place as a key; a pair of nodes has no order."""
+        items = ((k, v if isinstance(v, str) else frozenset(v)) for k, v in self.where.items())
+        return self.name, frozenset(items)
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Return the effect's parameters under their full names."""
+        return tuple(
+            Parameter(
+                f"{self.label}.{q.name}",
+                q.unit,
+                float(self.values[q.name]),
+                Log() if q.positive else Identity(),
+                q.prior_std,
+            )
+            for q in self.qualities()
+        )
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """Positions of the parameters that scale the effect (those with a null value)."""
+        return tuple(i for i, q in enumerate(self.qualities()) if q.null is not None)
+
+    def with_values(self, values: Mapping[str, float]) -> Self:
+        """Return the effect with some of its values replaced (short names)."""
+        return replace(self, values={**self.values, **values})
+
+    def at_parameters(self, named: Mapping[str, float]) -> Self:
+        """Return the effect with the values that a model gives to its full parameter names."""
+        prefix = f"{self.label}."
+        return self.with_values({k.removeprefix(prefix): v for k, v in named.items() if k.startswith(prefix)})
+
+    def with_amplitudes(self, amounts: FloatArray) -> Self | None:
+        """Return the effect with its amplitudes moved from null by ``amounts``; None if that is not physical."""
+        qualities = self.qualities()
+        moved = {}
+        for i, amount in zip(self.amplitudes, amounts, strict=True):
+            quality = qualities[i]
+            assert quality.null is not None
+            value = quality.null + float(amount)
+            if quality.positive and not value > 1e-12:
+                return None
+            moved[quality.name] = value
+        return self.with_values(moved)
+
+    def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
+        """Return d heat / d amplitude along the survey: per amplitude a list of (node, (n_points,) in W per unit)."""
+        columns: list[list[tuple[int, FloatArray]]] = []
+        parameters = [p.name for p in self.parameters()]
+        wanted = {parameters[i]: k for k, i in enumerate(self.amplitudes)}
+        columns = [[] for _ in wanted]
+        for term in self.addition(survey.layout).terms:
+            own = [p.name for p in term.parameters]
+            numbers = np.array([self._null_value(name) for name in own] + [1.0] * len(term.borrows))
+            for entry in term.evaluate(survey.along, numbers).d_values:
+                if entry.index < len(own) and own[entry.index] in wanted:
+                    columns[wanted[own[entry.index]]].append((entry.node, entry.series))
+        return columns
+
+    def _null_value(self, full_name: str) -> float:
+        short = full_name.removeprefix(f"{self.label}.")
+        quality = next(q for q in self.qualities() if q.name == short)
+        return float(self.values[short]) if quality.null is None else quality.null
+
+
+def require(where: Where, keys: tuple[str, ...], effect: str) -> None:
+    """Raise ModelError unless ``where`` has just these keys, with names as values and a pair under ``nodes``."""
+    for key in keys:
+        if key not in where:
+            raise ModelError(f"effect {effect}: where.{key} is missing")
+        value = where[key]
+        pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(v, str) for v in value)
+        if (key == "nodes" and not pair) or (key != "nodes" and not isinstance(value, str)):
+            raise ModelError(f"effect {effect}: where.{key} must be {'a pair of nodes' if key == 'nodes' else 'a name'}")
+    for key in where:
+        if key not in keys:
+            raise ModelError(f"effect {effect}: where.{key} is not one of {', '.join(keys)}")
+
+
+def to_json(effect: Effect) -> Json:
+    """Return an effect as plain data."""
+    where = {k: v if isinstance(v, str) else list(v) for k, v in effect.where.items()}
+    settings = {k: list(v) if isinstance(v, tuple) else v for k, v in effect.settings.items()}
+    return {"effect": effect.name, "where": where, "settings": settings, "values": dict(effect.values)}
