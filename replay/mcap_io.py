@@ -1,0 +1,180 @@
+"""MCAP files: one topic per telemetry channel, JSON messages with a JSON Schema, log time = sample time.
+
+A message is ``{"value": number}``; a foreign file may carry several numeric fields per message, each of which
+becomes a column ``topic.field``. Viewers such as Foxglove, Lichtblick and PlotJuggler plot ``<topic>.value``.
+"""
+
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import orjson
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from numpy.typing import NDArray
+
+from replay.errors import RecordingError
+from replay.recording import Recording, align
+
+METADATA_NAME = "thermal-twin"
+SCHEMA_NAME = "thermal_twin.Sample"
+VALUE = "value"
+
+Samples = dict[str, tuple[list[int], list[float]]]
+
+
+def write_mcap(
+    path: Path | str,
+    time_ns: NDArray[np.int64],
+    columns: Mapping[str, NDArray[np.float64]],
+    units: Mapping[str, str] | None = None,
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write columns to an MCAP file, messages in the order of time; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path
+        Where to write; an existing file is replaced.
+    time_ns : (n_times,)
+        Unix nanoseconds, strictly increasing, not negative.
+    columns : topic -> (n_times,)
+        Values in their own unit; NaN writes no message.
+    units : topic -> unit
+        Noted in the schema and in the channel's metadata.
+    metadata
+        Text pairs kept in the file.
+
+    Raises
+    ------
+    RecordingError
+        If an instant is negative, a value infinite, a shape wrong or the file cannot be written.
+    """
+    target = Path(path)
+    recording = Recording(time_ns, columns, units or {}, metadata or {})
+    _check_writable(target, recording)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as stream:
+            _write(stream, recording)
+        os.replace(partial, target)
+    except OSError as error:
+        raise RecordingError(f"{target}: cannot be written ({error.strerror or error})") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _check_writable(target: Path, recording: Recording) -> None:
+    if recording.time_ns.size and recording.time_ns[0] < 0:
+        raise RecordingError(f"{target}: row 1: time is before 1970, which an MCAP log time cannot express")
+    for name, column in recording.columns.items():
+        if np.isinf(column).any():
+            row = int(np.argmax(np.isinf(column))) + 1
+            raise RecordingError(f"{target}: row {row}: channel '{name}' is infinite")
+
+
+def _write(stream: IO[bytes], recording: Recording) -> None:
+    writer = Writer(stream)
+    writer.start(profile="", library="thermal-twin")
+    if recording.metadata:
+        writer.add_metadata(METADATA_NAME, dict(recording.metadata))
+    channels = [(_add_channel(writer, topic, recording.units.get(topic)), topic) for topic in recording.columns]
+    columns = [(channel, recording.columns[topic].tolist()) for channel, topic in channels]
+    for row, instant_ns in enumerate(recording.time_ns.tolist()):
+        for channel, values in columns:
+            value = values[row]
+            if value == value:  # NaN, the missing sample, is the one number unequal to itself
+                data = b'{"value":%b}' % orjson.dumps(value)
+                writer.add_message(channel, instant_ns, data, publish_time=instant_ns, sequence=row)
+    writer.finish()
+
+
+def _add_channel(writer: Writer, topic: str, unit: str | None) -> int:
+    """Register one topic and its schema; return the channel's number."""
+    schema = {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": SCHEMA_NAME,
+        "type": "object",
+        "properties": {VALUE: {"type": "number", "description": f"{topic} in {unit}" if unit else topic}},
+        "required": [VALUE],
+    }
+    schema_id = writer.register_schema(SCHEMA_NAME, "jsonschema", orjson.dumps(schema))
+    metadata = {"unit": unit} if unit else {}
+    return int(writer.register_channel(topic, "json", schema_id, metadata))
+
+
+def read_mcap(path: Path | str) -> Recording:
+    """Read every numeric JSON message of an MCAP file.
+
+    Returns
+    -------
+    Recording
+        One column per topic whose messages are ``{"value": number}``, one per ``topic.field`` otherwise,
+        on the union of their log times.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, truncated, not MCAP, not JSON-encoded, or holds no numeric message.
+    """
+    source = Path(path)
+    try:
+        with source.open("rb") as stream:
+            return _read(source, stream)
+    except OSError as error:
+        raise RecordingError(f"{source}: cannot be read ({error.strerror or error})") from error
+    except (McapError, struct.error, UnicodeDecodeError, EOFError) as error:
+        reason = str(error) or "it ends too early"
+        raise RecordingError(f"{source}: not a complete MCAP file ({reason}); record or copy it again") from error
+
+
+def _read(source: Path, stream: IO[bytes]) -> Recording:
+    if not source.stat().st_size:
+        raise RecordingError(f"{source}: is empty; record or copy it again")
+    reader = make_reader(stream)
+    samples: Samples = {}
+    units: dict[str, str] = {}
+    for _, channel, message in reader.iter_messages(log_time_order=False):
+        if channel.message_encoding != "json":
+            raise RecordingError(
+                f"{source}: topic '{channel.topic}' is encoded as {channel.message_encoding}, not json"
+            )
+        for name, value in _numbers(source, channel.topic, message.data):
+            times, values = samples.setdefault(name, ([], []))
+            times.append(message.log_time)
+            values.append(value)
+            if channel.metadata.get("unit"):
+                units[name] = channel.metadata["unit"]
+    if not samples:
+        raise RecordingError(f"{source}: holds no numeric messages")
+    return _assemble(samples, units, _metadata(reader))
+
+
+def _numbers(source: Path, topic: str, data: bytes) -> Iterator[tuple[str, float]]:
+    """Yield the column name and value of every number in one message."""
+    try:
+        message: Any = orjson.loads(data)
+    except orjson.JSONDecodeError as error:
+        raise RecordingError(f"{source}: topic '{topic}': a message is not JSON ({error.msg})") from error
+    if not isinstance(message, dict):
+        raise RecordingError(f"{source}: topic '{topic}': a message is not a JSON object")
+    for field, value in message.items():
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            yield (topic if field == VALUE else f"{topic}.{field}"), float(value)
+
+
+def _metadata(reader: Any) -> dict[str, str]:
+    return {key: text for record in reader.iter_metadata() for key, text in record.metadata.items()}
+
+
+def _assemble(samples: Samples, units: dict[str, str], metadata: dict[str, str]) -> Recording:
+    series = {
+        name: (np.array(times, dtype=np.int64), np.array(values, dtype=np.float64))
+        for name, (times, values) in samples.items()
+    }
+    aligned = align(series)
+    return Recording(aligned.time_ns, aligned.columns, units, metadata)
