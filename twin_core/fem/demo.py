@@ -23,9 +23,9 @@ _REGIONS: dict[str, tuple[tuple[float, float], tuple[float, float], str]] = {
     "px": ((0.975, 1.0), (0.0, 0.8), "heat_pipe_panel"),
     "mx": ((0.0, 0.025), (0.0, 0.8), "graphite_doubler"),
     "pz": ((0.025, 0.975), (0.775, 0.8), "heat_pipe_panel"),
-    "box": ((0.10, 0.40), (0.575, 0.775), "electronics_box"),
-    "battery": ((0.775, 0.975), (0.15, 0.40), "battery_pack"),
-    "tank": ((0.475, 0.775), (0.15, 0.45), "hydrazine_tank"),
+    "box": ((0.10, 0.40), (0.675, 0.775), "electronics_box"),
+    "battery": ((0.85, 0.975), (0.15, 0.40), "battery_pack"),
+    "tank": ((0.70, 0.85), (0.15, 0.40), "hydrazine_tank"),
 }
 _RADIATORS = {"px": ("px.right", 0.72, 0.64), "mx": ("mx.left", 0.68, 0.64), "pz": ("pz.top", 0.75, 0.76)}
 _JOINTS = {
@@ -242,7 +242,7 @@ def _by_channel(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any
 
 def _heater(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
     # Set points lie a little above the usual mean of each node, so that the heater is at work part of the time.
-    usual_K = {"px": 272.0, "mx": 272.0, "pz": 276.0, "box": 300.0, "battery": 288.0, "tank": 288.0}
+    usual_K = {"px": 263.0, "mx": 260.0, "pz": 274.0, "box": 294.0, "battery": 279.0, "tank": 280.0}
     node = _pick(rng, *NODES)
     set_K = usual_K[node] + float(rng.uniform(0.0, 4.0))
     power_W = float(rng.uniform(30.0, 60.0))
