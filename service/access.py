@@ -1,0 +1,107 @@
+"""Who may do what: API keys, their roles, and the gate in front of every route."""
+
+import hmac
+from enum import IntEnum
+from urllib.parse import urlsplit
+
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.problems import problem
+
+OPEN_PATHS = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json", "/favicon.ico"})
+OPEN_PREFIXES = ("/assets/", "/docs/")
+SUBPROTOCOL = "bearer."
+
+
+class Role(IntEnum):
+    """What a key allows; each role includes the ones before it."""
+
+    read = 1
+    ingest = 2
+    operate = 3
+
+
+def parse_keys(text: str) -> dict[str, Role]:
+    """Return key -> role from ``role:key`` pairs separated by commas.
+
+    Raises
+    ------
+    ValueError
+        Naming the position of a malformed pair, never the key.
+    """
+    keys: dict[str, Role] = {}
+    for position, pair in enumerate(filter(None, (part.strip() for part in text.split(","))), start=1):
+        role, separator, key = pair.partition(":")
+        if not separator or role not in Role.__members__ or not key:
+            raise ValueError(f"pair {position} must read role:key with role read, ingest or operate")
+        if key in keys:
+            raise ValueError(f"pair {position} repeats the key of an earlier pair")
+        keys[key] = Role[role]
+    return keys
+
+
+class Gate:
+    """ASGI layer: finds the caller's role before a byte of the body is read.
+
+    With keys, every path but the open ones needs one of them (401). Without keys only callers on this machine are
+    served, and no foreign web page may speak through a browser that runs here (403).
+    """
+
+    def __init__(self, app: ASGIApp, keys: dict[str, Role]) -> None:
+        """Keep the keys as bytes, compared in constant time."""
+        self._app = app
+        self._keys = [(key.encode(), role) for key, role in keys.items()]
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on with ``scope['state']['role']`` set, or refuse it."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = {name: value for name, value in scope["headers"] if name in _HEADERS}
+        role = self._role(headers) if self._keys else Role.operate
+        refusal = self._refusal(scope, headers, role)
+        if refusal is None:
+            scope.setdefault("state", {})["role"] = role
+            await self._app(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await receive()
+            await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
+        else:
+            status, detail = refusal
+            extra = {"WWW-Authenticate": "Bearer"} if status == 401 else None
+            await problem(status, detail, headers=extra)(scope, receive, send)
+
+    def _role(self, headers: dict[bytes, bytes]) -> Role | None:
+        given = headers.get(b"authorization", b"")
+        scheme, _, key = given.partition(b" ")
+        if scheme.lower() != b"bearer":
+            protocols = headers.get(b"sec-websocket-protocol", b"").split(b",")
+            marked = [p.strip() for p in protocols if p.strip().startswith(SUBPROTOCOL.encode())]
+            key = marked[0].removeprefix(SUBPROTOCOL.encode()) if marked else b""
+        found = [role for known, role in self._keys if hmac.compare_digest(known, key.strip())]
+        return found[0] if found else None
+
+    def _refusal(self, scope: Scope, headers: dict[bytes, bytes], role: Role | None) -> tuple[int, str] | None:
+        path = scope["path"]
+        if path in OPEN_PATHS or path.startswith(OPEN_PREFIXES):
+            return None
+        if role is None:
+            return 401, "a valid API key is needed: send 'Authorization: Bearer KEY'"
+        if not self._keys and not _is_local(scope.get("client")):
+            return 403, "this service has no API keys, so it answers callers on its own machine only"
+        origin = headers.get(b"origin")
+        if origin is not None and not self._keys and _netloc(origin) != headers.get(b"host", b"").decode("latin-1"):
+            return 403, "requests from other web sites are refused"
+        return None
+
+
+_HEADERS = frozenset({b"authorization", b"sec-websocket-protocol", b"origin", b"host"})
+
+
+def _netloc(origin: bytes) -> str:
+    return urlsplit(origin.decode("latin-1")).netloc
+
+
+def _is_local(client: tuple[str, int] | None) -> bool:
+    """Return whether the caller is this machine; callers without an address come over a local socket or in process."""
+    return client is None or client[0] in ("testclient", "::1") or client[0].startswith("127.")

@@ -1,0 +1,160 @@
+"""Telemetry bodies -> one batch of arrays: JSON columns or NDJSON frames, refused whole if anything is malformed."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from service.instants import Instants, parse_instants
+from service.problems import BadField, Problem
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples in the order of their arrival.
+
+    Attributes
+    ----------
+    time_us : (n_times,)
+        Microseconds since 1970.
+    values : (n_channels, n_times)
+        In the channels' own units, rows in the order of the twin's channels; NaN is a missing sample.
+    """
+
+    time_us: Instants
+    values: NDArray[np.float64]
+
+
+def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
+    """Return the batch of ``{"time": [...], "values": {channel: [...]}}``.
+
+    Raises
+    ------
+    Problem
+        400 if the body is not JSON, 422 naming the field otherwise.
+    """
+    document = _load(body, "body")
+    times, columns = _members(document, "")
+    if not isinstance(times, list):
+        raise BadField("time", "must be a list")
+    values = np.full((len(channels), len(times)), np.nan)
+    positions = {name: row for row, name in enumerate(channels)}
+    for name, column in columns.items():
+        row = _position(positions, name, f"values.{name}")
+        if not isinstance(column, list):
+            raise BadField(f"values.{name}", "must be a list with one value or null per time")
+        if len(column) != len(times):
+            raise BadField(f"values.{name}", f"has {len(column)} values, time has {len(times)}")
+        values[row] = _numbers(column, partial(_element, name))
+    return Batch(parse_instants(times), values)
+
+
+def parse_frames(body: bytes, channels: Sequence[str]) -> Batch:
+    """Return the batch of NDJSON frames ``{"time": ..., "values": {channel: ...}}``, one per line.
+
+    Raises
+    ------
+    Problem
+        400 naming the line that is not JSON, 422 naming line and field otherwise.
+    """
+    lines = [line for line in body.split(b"\n") if line.strip()]
+    frames = [_members(_load(line, f"line {n}"), f"line {n}: ") for n, line in enumerate(lines, start=1)]
+    known = set(channels)
+    for number, (_, sample) in enumerate(frames, start=1):
+        if not known.issuperset(sample):
+            stranger = next(name for name in sample if name not in known)
+            _position({name: 0 for name in channels}, stranger, f"line {number}: values.{stranger}")
+    values = np.full((len(channels), len(frames)), np.nan)
+    for row, name in enumerate(channels):
+        column = [sample.get(name) for _, sample in frames]
+        values[row] = _numbers(column, partial(_line_field, name))
+    return Batch(_frame_times([time for time, _ in frames]), values)
+
+
+def _frame_times(times: list[Any]) -> Instants:
+    try:
+        return parse_instants(times)
+    except BadField as error:
+        field, reason = error.errors[0]
+        number = int(field.removeprefix("time[").removesuffix("]")) + 1
+        raise BadField(f"line {number}: time", reason) from None
+
+
+def _load(body: bytes, where: str) -> Any:
+    try:
+        return orjson.loads(body)
+    except orjson.JSONDecodeError as error:
+        field = _find_non_finite(body)
+        if field is not None:
+            raise BadField(field if where == "body" else f"{where}: {field}", "is not a finite number") from None
+        raise Problem(
+            400, f"{where}: not valid JSON ({error.msg.split(':')[0]})", [(where, "not valid JSON")]
+        ) from None
+
+
+def _find_non_finite(body: bytes) -> str | None:
+    """Return the place of the first NaN, Infinity or overflowing number, if that is what is wrong with the body."""
+    try:
+        return _search(json.loads(body), "")
+    except (ValueError, RecursionError):
+        return None
+
+
+def _search(item: Any, where: str) -> str | None:
+    if isinstance(item, float):
+        return (where or "body") if not np.isfinite(item) else None
+    if isinstance(item, dict):
+        children = ((child, f"{where}.{key}" if where else key) for key, child in item.items())
+    elif isinstance(item, list):
+        children = ((child, f"{where}[{index}]") for index, child in enumerate(item))
+    else:
+        return None
+    return next((found for child, place in children if (found := _search(child, place))), None)
+
+
+def _members(document: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
+    """Return the two members that a body or frame must have, and refuse any other."""
+    if not isinstance(document, dict):
+        raise BadField(f"{prefix}body", 'must be an object {"time": ..., "values": {...}}')
+    for name in ("time", "values"):
+        if name not in document:
+            raise BadField(f"{prefix}{name}", "is missing")
+    if len(document) != 2:
+        stranger = next(name for name in document if name not in ("time", "values"))
+        raise BadField(f"{prefix}{stranger}", "unknown field; only time and values are expected")
+    if not isinstance(document["values"], dict):
+        raise BadField(f"{prefix}values", "must be an object with one member per channel")
+    return document["time"], document["values"]
+
+
+def _position(positions: dict[str, int], name: str, field: str) -> int:
+    if name not in positions:
+        raise BadField(field, f"unknown channel '{name}' (known: {', '.join(positions)})")
+    return positions[name]
+
+
+def _element(name: str, index: int) -> str:
+    return f"values.{name}[{index}]"
+
+
+def _line_field(name: str, index: int) -> str:
+    return f"line {index + 1}: values.{name}"
+
+
+_NUMBERS = {float, int, type(None)}
+
+
+def _numbers(column: list[Any], field: Callable[[int], str]) -> NDArray[np.float64]:
+    """Return finite numbers with NaN for null, (n_times,); text and booleans are not numbers."""
+    if not _NUMBERS.issuperset(map(type, column)):
+        index = next(i for i, value in enumerate(column) if type(value) not in _NUMBERS)
+        raise BadField(field(index), f"must be a finite number or null, got {json.dumps(column[index])[:60]}")
+    numbers = np.array(column, dtype=np.float64)
+    if np.isinf(numbers).any():
+        raise BadField(field(int(np.argmax(np.isinf(numbers)))), "is not a finite number")
+    return numbers

@@ -1,0 +1,214 @@
+"""What travels over the wire. Clients import this module and nothing else of the service."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+Instant = str
+"""RFC 3339 UTC."""
+
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+JobKind = Literal["calibration", "diagnosis"]
+Source = Literal["calibration", "diagnosis", "manual"]
+
+
+def _not_boolean(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _time_form(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ValueError("must be RFC 3339 or unix seconds")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
+Time = Annotated[str | float, BeforeValidator(_time_form)]
+Quantile = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=1)]
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="allow")
+
+
+class TwinInfo(_Answer):
+    """A registered twin. Times are null while its archive is empty."""
+
+    id: str
+    created: Instant
+    samples: int
+    first_time: Instant | None
+    last_time: Instant | None
+    active_model: int | None
+    seq: int
+    channels: list[str]
+
+
+class TwinDetail(TwinInfo):
+    """A registered twin with its specification."""
+
+    specification: dict[str, Any]
+
+
+class TwinList(_Answer):
+    """Every registered twin."""
+
+    twins: list[TwinInfo]
+
+
+class Rejection(_Answer):
+    """A well-formed sample that was not taken in."""
+
+    index: int
+    reason: str
+
+
+class IngestReport(_Answer):
+    """What became of the samples of one request."""
+
+    accepted: int
+    duplicates: int
+    rejected: list[Rejection]
+    last_time: Instant | None
+
+
+class Columns(BaseModel):
+    """Samples as columns: one value or null per time and channel, in the channel's own unit."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    time: list[Time]
+    values: dict[str, list[Number | None]]
+
+
+class Archive(_Answer):
+    """A part of the archive; ``downsampled`` tells that extremes were kept and other samples left out."""
+
+    time: list[Instant]
+    values: dict[str, list[float | None]]
+    units: dict[str, str | None]
+    samples: int
+    downsampled: bool
+
+
+class CalibrationRequest(_Request):
+    """What a calibration uses: the whole archive unless a part is named."""
+
+    method: str = "second-order"
+    start: Time | None = None
+    stop: Time | None = None
+    activate: bool | None = Field(None, description="true: always, false: never, absent: if it is the better one")
+
+
+class DiagnosisRequest(_Request):
+    """What a diagnosis uses and how much of it is held back for the score."""
+
+    start: Time | None = None
+    stop: Time | None = None
+    holdout: Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=1)] = 0.3
+    burn_in_s: Positive | None = None
+    false_alarm_rate: Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=0.5)] = 0.01
+    activate: bool = False
+
+
+class Job(_Answer):
+    """A calibration or a diagnosis."""
+
+    id: str
+    kind: JobKind
+    state: JobState
+    progress: float
+    message: str
+    created: Instant
+    started: Instant | None
+    finished: Instant | None
+    result: dict[str, Any] | None
+
+    @property
+    def done(self) -> bool:
+        """Whether the job has ended, well or not."""
+        return self.state in ("succeeded", "failed", "cancelled")
+
+
+class JobList(_Answer):
+    """Jobs of one twin, the newest first."""
+
+    jobs: list[Job]
+
+
+class ModelInfo(_Answer):
+    """One version of a twin's model."""
+
+    version: int
+    active: bool
+    created: Instant
+    source: Source
+    train: dict[str, Any]
+    validation: dict[str, Any]
+    effects: list[dict[str, Any]]
+
+
+class ModelList(_Answer):
+    """Every version of a twin's model, the oldest first."""
+
+    models: list[ModelInfo]
+
+
+class ForecastRequest(_Request):
+    """How far to look ahead, and what the inputs will do; inputs without a plan hold their last value."""
+
+    horizon_s: Positive
+    step_s: Positive | None = None
+    plan: Columns | None = None
+    quantiles: list[Quantile] = Field(default=[0.05, 0.5, 0.95], min_length=1, max_length=20)
+
+
+class Forecast(_Answer):
+    """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit."""
+
+    model_version: int
+    issued: Instant
+    time: list[Instant]
+    values: dict[str, dict[str, list[float]]]
+    units: dict[str, str | None]
+
+
+class Residuals(_Answer):
+    """Innovations (measured minus predicted one step ahead) and their normalised squares."""
+
+    time: list[Instant]
+    residual_K: dict[str, list[float | None]]
+    nis: list[float | None]
+    model_version: list[int]
+
+
+class Anomaly(_Answer):
+    """An interval in which a sensor does not behave as its model; ``stop`` is null while it lasts."""
+
+    id: int
+    sensor: str
+    start: Instant
+    stop: Instant | None
+    score: float
+    cause: dict[str, Any] | None
+
+
+class AnomalyList(_Answer):
+    """Anomalies of one twin, the newest first."""
+
+    anomalies: list[Anomaly]
+
+
+class Message(_Answer):
+    """One message of a stream."""
+
+    type: Literal["sample", "residual", "anomaly", "job", "model", "dropped"]
+    seq: int
+    time: Instant

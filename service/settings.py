@@ -1,0 +1,93 @@
+"""Settings: read once from ``TWIN_*`` environment variables into one frozen record."""
+
+import ipaddress
+from pathlib import Path
+from typing import Any
+
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.access import Role, parse_keys
+from twin_core.errors import TwinError
+
+MIB = 1024 * 1024
+
+
+class SettingsError(TwinError):
+    """A setting is wrong, or the settings together would be unsafe."""
+
+
+class Settings(BaseSettings):
+    """Everything that the service can be told. Each field is read from ``TWIN_<FIELD>``."""
+
+    model_config = SettingsConfigDict(env_prefix="TWIN_", frozen=True, extra="ignore")
+
+    host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback needs TWIN_API_KEYS.")
+    port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 picks a free one.")
+    database_url: str = Field("sqlite:///thermal-twin.sqlite3", description="Where everything is stored.")
+    api_keys: SecretStr = Field(SecretStr(""), description="role:key pairs separated by commas.")
+    max_body_bytes: int = Field(16 * MIB, ge=1024, description="Largest request body, after decompression.")
+    body_timeout_s: float = Field(30.0, gt=0, description="Longest wait for a request body (plus 32 KiB/s).")
+    stream_buffer: int = Field(
+        1000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
+    )
+    job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
+    job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
+    assimilate: bool = Field(True, description="Whether new samples update the state of the active model.")
+    calibrate_every_s: float | None = Field(None, gt=0, description="Recalibrate on this schedule; unset: on request.")
+    log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
+
+    @field_validator("database_url")
+    @classmethod
+    def _is_sqlite(cls, value: str) -> str:
+        if not value.startswith("sqlite:///") or len(value) <= len("sqlite:///"):
+            raise ValueError("must be sqlite:///FILE (sqlite:////FILE for an absolute path)")
+        return value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _keys_parse(cls, value: SecretStr) -> SecretStr:
+        parse_keys(value.get_secret_value())
+        return value
+
+    @model_validator(mode="after")
+    def _open_only_on_loopback(self) -> "Settings":
+        if not self.roles and not is_loopback(self.host):
+            raise ValueError(f"host {self.host} is not loopback and TWIN_API_KEYS is empty; set keys or use 127.0.0.1")
+        return self
+
+    @property
+    def roles(self) -> dict[str, Role]:
+        """API key -> role."""
+        return parse_keys(self.api_keys.get_secret_value())
+
+    @property
+    def database_path(self) -> Path:
+        """The SQLite file."""
+        return Path(self.database_url.removeprefix("sqlite:///"))
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address can only be reached from this machine."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def read_settings(**overrides: Any) -> Settings:
+    """Return the settings of the environment, with ``overrides`` in their place.
+
+    Raises
+    ------
+    SettingsError
+        With one line naming the variable, and never its value where it is secret.
+    """
+    try:
+        return Settings(**overrides)
+    except ValidationError as error:
+        first = error.errors(include_input=False, include_url=False)[0]
+        name = f"TWIN_{str(first['loc'][0]).upper()}: " if first["loc"] else ""
+        raise SettingsError(name + first["msg"].removeprefix("Value error, ")) from None

@@ -1,0 +1,172 @@
+"""Schema steps, each applied once and recorded in the transaction that applies it."""
+
+import sqlite3
+from collections.abc import Callable
+
+Step = Callable[[sqlite3.Connection], None]
+
+
+def _run(connection: sqlite3.Connection, script: str) -> None:
+    """Execute statements one by one: ``executescript`` would commit the transaction they belong to."""
+    for statement in filter(str.strip, script.split(";")):
+        connection.execute(statement)
+
+
+def _twins_and_samples(connection: sqlite3.Connection) -> None:
+    _run(
+        connection,
+        """
+        CREATE TABLE twin (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            name TEXT NOT NULL UNIQUE,
+            specification TEXT NOT NULL,
+            created_us INTEGER NOT NULL
+        );
+        CREATE TABLE head (
+            twin INTEGER PRIMARY KEY REFERENCES twin(id) ON DELETE CASCADE,
+            seq INTEGER NOT NULL DEFAULT 0,
+            samples INTEGER NOT NULL DEFAULT 0,
+            first_us INTEGER,
+            last_us INTEGER,
+            small_chunks INTEGER NOT NULL DEFAULT 0,
+            small_rows INTEGER NOT NULL DEFAULT 0
+        );
+        CREATE TABLE chunk (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            n INTEGER NOT NULL,
+            first_us INTEGER NOT NULL,
+            last_us INTEGER NOT NULL,
+            last_seq INTEGER NOT NULL,
+            seq BLOB NOT NULL,
+            time BLOB NOT NULL,
+            value BLOB NOT NULL
+        );
+        CREATE INDEX chunk_span ON chunk (twin, last_us, first_us, n);
+        CREATE INDEX chunk_seq ON chunk (twin, last_seq);
+        """,
+    )
+
+
+def _models_and_jobs(connection: sqlite3.Connection) -> None:
+    _run(
+        connection,
+        """
+        CREATE TABLE model (
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            version INTEGER NOT NULL,
+            created_us INTEGER NOT NULL,
+            source TEXT NOT NULL,
+            summary TEXT NOT NULL,
+            document TEXT NOT NULL,
+            PRIMARY KEY (twin, version)
+        );
+        CREATE TABLE activation (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL,
+            version INTEGER NOT NULL,
+            at_us INTEGER NOT NULL,
+            reason TEXT NOT NULL,
+            FOREIGN KEY (twin, version) REFERENCES model (twin, version) ON DELETE CASCADE
+        );
+        CREATE INDEX activation_twin ON activation (twin, id);
+        CREATE TABLE job (
+            number INTEGER PRIMARY KEY AUTOINCREMENT,
+            id TEXT NOT NULL UNIQUE,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            kind TEXT NOT NULL,
+            state TEXT NOT NULL,
+            progress REAL NOT NULL DEFAULT 0,
+            message TEXT NOT NULL DEFAULT '',
+            request TEXT NOT NULL,
+            created_us INTEGER NOT NULL,
+            started_us INTEGER,
+            finished_us INTEGER,
+            result TEXT,
+            page TEXT
+        );
+        CREATE INDEX job_twin ON job (twin, kind, number);
+        CREATE TABLE event (
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            seq INTEGER NOT NULL,
+            time_us INTEGER NOT NULL,
+            type TEXT NOT NULL,
+            body TEXT NOT NULL,
+            PRIMARY KEY (twin, seq)
+        ) WITHOUT ROWID;
+        """,
+    )
+
+
+def _residuals_and_anomalies(connection: sqlite3.Connection) -> None:
+    _run(
+        connection,
+        """
+        CREATE TABLE residual (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            version INTEGER NOT NULL,
+            n INTEGER NOT NULL,
+            first_us INTEGER NOT NULL,
+            last_us INTEGER NOT NULL,
+            last_seq INTEGER NOT NULL,
+            seq BLOB NOT NULL,
+            time BLOB NOT NULL,
+            value BLOB NOT NULL
+        );
+        CREATE INDEX residual_span ON residual (twin, last_us, first_us, n);
+        CREATE INDEX residual_seq ON residual (twin, last_seq);
+        CREATE TABLE checkpoint (
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            version INTEGER NOT NULL,
+            time_us INTEGER NOT NULL,
+            state TEXT NOT NULL,
+            PRIMARY KEY (twin, version, time_us)
+        ) WITHOUT ROWID;
+        CREATE TABLE anomaly (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            sensor TEXT NOT NULL,
+            kind TEXT NOT NULL,
+            start_us INTEGER NOT NULL,
+            stop_us INTEGER,
+            score REAL NOT NULL,
+            cause TEXT,
+            version INTEGER NOT NULL
+        );
+        CREATE INDEX anomaly_twin ON anomaly (twin, start_us);
+        """,
+    )
+
+
+STEPS: tuple[tuple[str, Step], ...] = (
+    ("twins and samples", _twins_and_samples),
+    ("models and jobs", _models_and_jobs),
+    ("residuals and anomalies", _residuals_and_anomalies),
+)
+
+
+def migrate(connection: sqlite3.Connection) -> list[str]:
+    """Apply the steps that this database has not seen; return their names.
+
+    Raises
+    ------
+    sqlite3.DatabaseError
+        If the file is not a database, or was written by a newer version of the service.
+    """
+    connection.execute(
+        "CREATE TABLE IF NOT EXISTS migration (name TEXT PRIMARY KEY, at TEXT DEFAULT CURRENT_TIMESTAMP)"
+    )
+    done = {name for (name,) in connection.execute("SELECT name FROM migration")}
+    unknown = done - {name for name, _ in STEPS}
+    if unknown:
+        raise sqlite3.DatabaseError(f"it was written by a newer version (step '{sorted(unknown)[0]}')")
+    applied = []
+    for name, step in STEPS:
+        if name not in done:
+            connection.execute("BEGIN IMMEDIATE")
+            step(connection)
+            connection.execute("INSERT INTO migration (name) VALUES (?)", (name,))
+            connection.execute("COMMIT")
+            applied.append(name)
+    return applied

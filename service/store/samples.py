@@ -1,0 +1,201 @@
+"""Samples: append-only chunks of whole batches, never a row per sample.
+
+A chunk holds three arrays as little-endian bytes: the stream numbers and instants (n_times,) and the values
+(n_channels, n_times). Small chunks are rewritten as one from time to time; what they hold never changes.
+"""
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.frames import Batch
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, collapse, merge
+
+SMALL = 512
+"""Chunks with fewer rows than this are compacted."""
+MOST_SMALL_CHUNKS = 64
+MOST_SMALL_ROWS = 16_384
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """What became of a batch: (n_times,) status, the number of the first stored sample, the archive's last instant."""
+
+    status: NDArray[np.int8]
+    first_seq: int
+    last_us: int | None
+
+    @property
+    def stored(self) -> NDArray[np.bool_]:
+        """Which samples were stored."""
+        return self.status == ACCEPTED
+
+    @property
+    def duplicates(self) -> int:
+        """How many samples were known already."""
+        return int(np.count_nonzero(self.status == DUPLICATE))
+
+    @property
+    def conflicts(self) -> list[int]:
+        """Where the samples stand that contradict the archive."""
+        return np.flatnonzero(self.status == CONFLICT).tolist()
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Samples in the order of time: (n_times,) instants, (n_channels, n_times) values with NaN where missing."""
+
+    time_us: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+
+def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
+    """Store what is new in a batch."""
+    head = _head(connection, twin)
+    time_us = batch.time_us
+    if time_us.size == 0:
+        return Receipt(np.empty(0, dtype=np.int8), head[0] + 1, head[1])
+    in_order = bool((time_us[1:] > time_us[:-1]).all())
+    if in_order and (head[1] is None or time_us[0] > head[1]):
+        status, n_instants = np.zeros(time_us.size, dtype=np.int8), time_us.size
+    else:
+        fate = merge(*_around(connection, twin, batch), time_us, batch.values)
+        status, n_instants = fate.status, fate.n_instants
+    kept = status == ACCEPTED
+    if not kept.any():
+        return Receipt(status, head[0] + 1, head[1])
+    stored = batch if kept.all() else Batch(time_us[kept], batch.values[:, kept])
+    last_us = _store(connection, twin, stored, head[0], n_instants)
+    return Receipt(status, head[0] + 1, last_us)
+
+
+def _head(connection: sqlite3.Connection, twin: int) -> tuple[int, int | None]:
+    row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
+    if row is None:
+        raise LookupError(f"twin {twin} is gone")
+    return row[0], row[1]
+
+
+def _store(connection: sqlite3.Connection, twin: int, batch: Batch, seq: int, n_instants: int) -> int:
+    """Write one chunk and move the head; return the archive's last instant."""
+    n = int(batch.time_us.size)
+    first_us, last_us = int(batch.time_us.min()), int(batch.time_us.max())
+    _insert(connection, twin, np.arange(seq + 1, seq + 1 + n), batch.time_us, batch.values)
+    small = n < SMALL
+    row = connection.execute(
+        """UPDATE head SET seq = seq + ?, samples = samples + ?,
+           first_us = min(coalesce(first_us, ?), ?), last_us = max(coalesce(last_us, ?), ?),
+           small_chunks = small_chunks + ?, small_rows = small_rows + ?
+           WHERE twin = ? RETURNING last_us, small_chunks, small_rows""",
+        (n, n_instants, first_us, first_us, last_us, last_us, small, n if small else 0, twin),
+    ).fetchone()
+    if row[1] >= MOST_SMALL_CHUNKS or row[2] >= MOST_SMALL_ROWS:
+        _compact(connection, twin, values_rows=batch.values.shape[0])
+    return int(row[0])
+
+
+def _insert(
+    connection: sqlite3.Connection,
+    twin: int,
+    seq: NDArray[np.int64],
+    time_us: NDArray[np.int64],
+    values: NDArray[np.float64],
+) -> None:
+    connection.execute(
+        "INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        (
+            twin,
+            int(time_us.size),
+            int(time_us.min()),
+            int(time_us.max()),
+            int(seq.max()),
+            np.ascontiguousarray(seq, dtype="<i8").data,
+            np.ascontiguousarray(time_us, dtype="<i8").data,
+            np.ascontiguousarray(values, dtype="<f8").data,
+        ),
+    )
+
+
+def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> None:
+    """Rewrite the small chunks as one, in the order of arrival."""
+    rows = connection.execute(
+        "SELECT id, seq, time, value FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
+    ).fetchall()
+    seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])
+    time_us = np.concatenate([np.frombuffer(row[2], dtype="<i8") for row in rows])
+    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)
+    connection.executemany("DELETE FROM chunk WHERE id = ?", [(row[0],) for row in rows])
+    _insert(connection, twin, seq, time_us, values)
+    n = int(time_us.size)
+    remaining = (1, n) if n < SMALL else (0, 0)
+    connection.execute("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", (*remaining, twin))
+
+
+def _matrix(blob: bytes, n_rows: int) -> NDArray[np.float64]:
+    return np.frombuffer(blob, dtype="<f8").reshape(n_rows, -1)
+
+
+def _around(connection: sqlite3.Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
+    instants = np.unique(batch.time_us)
+    spans = np.array(
+        connection.execute(
+            "SELECT id, first_us, last_us FROM chunk WHERE twin = ? AND last_us >= ? AND first_us <= ?",
+            (twin, int(instants[0]), int(instants[-1])),
+        ).fetchall(),
+        dtype=np.int64,
+    ).reshape(-1, 3)
+    hit = np.searchsorted(instants, spans[:, 1]) < np.searchsorted(instants, spans[:, 2], side="right")
+    times, values = [np.empty(0, dtype=np.int64)], [np.empty((batch.values.shape[0], 0))]
+    for (chunk,) in spans[hit, :1].tolist():
+        time, value = connection.execute("SELECT time, value FROM chunk WHERE id = ?", (chunk,)).fetchone()
+        time_us = np.frombuffer(time, dtype="<i8")
+        wanted = np.isin(time_us, instants)
+        times.append(time_us[wanted])
+        values.append(_matrix(value, batch.values.shape[0])[:, wanted])
+    time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
+    return collapse(time_us, matrix) if time_us.size else (time_us, matrix)
+
+
+def select(
+    connection: sqlite3.Connection,
+    twin: int,
+    n_channels: int,
+    rows: Sequence[int],
+    start_us: int | None = None,
+    stop_us: int | None = None,
+) -> Samples:
+    """Return the samples with start <= time < stop, of the channels whose positions ``rows`` names."""
+    start = start_us if start_us is not None else -(2**62)
+    stop = stop_us if stop_us is not None else 2**62
+    chosen = list(rows)
+    times, values = [np.empty(0, dtype=np.int64)], [np.empty((len(chosen), 0))]
+    query = "SELECT time, value FROM chunk WHERE twin = ? AND last_us >= ? AND first_us < ? ORDER BY first_us, id"
+    for time, value in connection.execute(query, (twin, start, stop)):
+        time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)[chosen]
+        inside = (time_us >= start) & (time_us < stop)
+        whole = bool(inside.all())
+        times.append(time_us if whole else time_us[inside])
+        values.append(matrix if whole else matrix[:, inside])
+    time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
+    return Samples(*collapse(time_us, matrix)) if time_us.size else Samples(time_us, matrix)
+
+
+def since_seq(
+    connection: sqlite3.Connection, twin: int, n_channels: int, after_seq: int
+) -> tuple[NDArray[np.int64], Samples]:
+    """Return stream numbers and samples after one number, in the order of arrival."""
+    seqs, times, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((n_channels, 0))]
+    query = "SELECT seq, time, value FROM chunk WHERE twin = ? AND last_seq > ?"
+    for seq, time, value in connection.execute(query, (twin, after_seq)):
+        numbers = np.frombuffer(seq, dtype="<i8")
+        new = numbers > after_seq
+        seqs.append(numbers[new])
+        times.append(np.frombuffer(time, dtype="<i8")[new])
+        values.append(_matrix(value, n_channels)[:, new])
+    numbers = np.concatenate(seqs)
+    order = np.argsort(numbers)
+    return numbers[order], Samples(np.concatenate(times)[order], np.concatenate(values, axis=1)[:, order])
