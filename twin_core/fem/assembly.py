@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.sparse import block_array, block_diag, csc_array, csr_array, diags_array, hstack, vstack
+from scipy.sparse import block_diag, csc_array, csr_array, diags_array, hstack, vstack
 from skfem import Basis, ElementQuad1, FacetBasis
 
 from twin_core._typing import FloatArray, IntArray
@@ -182,7 +182,8 @@ def _with_masses(field: Field, assembler: Assembler, masses: Sequence[Mass]) -> 
         coupled = csc_array(coupled + matrix)
         columns.append(vector)
     link = csc_array(-np.stack(columns, axis=1))
-    own = diags_array([item.conductance_W_per_K for item in masses])
+    own = csc_array(np.diag([item.conductance_W_per_K for item in masses]))
+    conductance = vstack([hstack([field.conductance_matrix + coupled, link]), hstack([link.T, own])])
     extra_capacity = diags_array([item.capacity_J_per_K for item in masses])
     start_K = [field.share[item.region] @ field.start_K for item in masses]
 
@@ -195,7 +196,7 @@ def _with_masses(field: Field, assembler: Assembler, masses: Sequence[Mass]) -> 
     return replace(
         field,
         capacity_matrix=csc_array(block_diag([field.capacity_matrix, extra_capacity])),
-        conductance_matrix=csc_array(block_array([[field.conductance_matrix + coupled, link], [link.T, own]])),
+        conductance_matrix=csc_array(conductance),
         inputs=tall(field.inputs),
         boundary_inputs=tall(field.boundary_inputs),
         radiation=replace(field.radiation, trace=wide(field.radiation.trace)),

@@ -1,5 +1,6 @@
 """The demonstration: a small spacecraft in orbit, one effect that nobody declared, and the operator's specification."""
 
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -61,10 +62,10 @@ def demo_scenario(effect: str, seed: int) -> tuple[Scenario, TwinSpec]:
     rng = np.random.default_rng([seed, 20])
     body = _body(seed, rng)
     operator = load_spec(_operator(body, rng))
-    place = np.random.default_rng([seed, 21])
-    drawn = list(DEMO_EFFECTS)[int(place.integers(len(DEMO_EFFECTS)))]
+    drawn = list(DEMO_EFFECTS)[int(np.random.default_rng([seed, 21]).integers(len(DEMO_EFFECTS)))]
     name = drawn if effect == "random" else effect
     if name != "none":
+        place = np.random.default_rng([seed, 22, zlib.crc32(name.encode())])
         body["hidden"] = [{"effect": name} | DEMO_EFFECTS[name](place, body)]
     return load_scenario(body), operator
 
@@ -231,11 +232,11 @@ def _constant(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
 
 def _by_channel(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
     if "mode" in body["forcings"]:
-        channel, knots = "mode", (0.0, 1.0, 2.0)
-        values = (0.0, rng.uniform(15.0, 30.0), rng.uniform(35.0, 55.0))
+        channel, knots = "mode", [0.0, 1.0, 2.0]
+        values = [0.0, rng.uniform(15.0, 30.0), rng.uniform(35.0, 55.0)]
     else:
-        channel, knots = "pitch", (0.0, 60.0, 120.0, 180.0)
-        values = (0.0, rng.uniform(25.0, 40.0), rng.uniform(35.0, 50.0), rng.uniform(0.0, 15.0))
+        channel, knots = "pitch", [0.0, 60.0, 120.0, 180.0]
+        values = [0.0, rng.uniform(25.0, 40.0), rng.uniform(35.0, 50.0), rng.uniform(0.0, 15.0)]
     values_W = [float(value) for value in values]
     return {"node": _pick(rng, *NODES), "channel": channel, "knots": knots, "values_W": values_W}
 

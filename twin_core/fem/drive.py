@@ -37,7 +37,7 @@ def clock_of(scenario: Scenario) -> Clock:
     before = int(np.ceil(time.settle_s / time.step_s - 1e-9))
     # One more sample interval, so that the last sample has steps on both sides even when it jitters.
     after = int(np.ceil((time.duration_s + time.sample_s) / time.step_s - 1e-9))
-    return Clock(np.arange(-before, after) * time.step_s, time.step_s)
+    return Clock(np.arange(-before, after, dtype=np.float64) * float(time.step_s), time.step_s)
 
 
 def generator(scenario: Scenario, purpose: str) -> np.random.Generator:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
@@ -33,12 +34,17 @@ class Radiation:
     def heat_W(self, temperature_K: FloatArray, boundary_K: FloatArray) -> FloatArray:
         """Return the heat into every unknown, (n_unknowns, n_cases); boundary_K is (n_boundaries, n_cases)."""
         at_points = self.trace @ temperature_K
-        return self.trace.T @ (self.weight[:, None] * (boundary_K[self.sink] ** 4 - at_points**4))
+        return self.spread @ (self.weight[:, None] * (boundary_K[self.sink] ** 4 - at_points**4))
+
+    @cached_property
+    def spread(self) -> csr_array:
+        """The transposed trace, (n_unknowns, n_points), kept because turning it round costs more than using it."""
+        return csr_array(self.trace.T)
 
     def slope_W_per_K(self, temperature_K: FloatArray) -> csc_array:
         """Return minus the derivative of the heat at one temperature field (n_unknowns,), symmetric."""
         at_points = self.trace @ temperature_K
-        return csc_array(self.trace.T @ diags_array(4.0 * self.weight * at_points**3) @ self.trace)
+        return csc_array(self.spread @ diags_array(4.0 * self.weight * at_points**3) @ self.trace)
 
 
 @dataclass(frozen=True)
@@ -98,4 +104,4 @@ class Field:
         mine = [i for i, pair in enumerate(self.radiators) if pair == (node, sink)]
         points = np.isin(self.radiation.owner, mine)
         at_points = self.radiation.trace @ temperature_K
-        return self.radiation.trace.T @ (points * self.radiation.weight * (sink_K**4 - at_points**4))
+        return self.radiation.spread @ (points * self.radiation.weight * (sink_K**4 - at_points**4))

@@ -15,7 +15,8 @@ from twin_core.telemetry import Record
 def sample_times(scenario: Scenario) -> FloatArray:
     """Return the sampling instants, (n_times,): a regular grid from 0, jittered if asked."""
     time = scenario.time
-    grid = np.arange(int(np.floor(time.duration_s / time.sample_s + 1e-9)) + 1) * time.sample_s
+    count = int(np.floor(time.duration_s / time.sample_s + 1e-9)) + 1
+    grid: FloatArray = np.arange(count, dtype=np.float64) * time.sample_s
     if time.jitter_s:
         shift = generator(scenario, "sampling").uniform(-time.jitter_s, time.jitter_s, grid.size)
         shift[0] = abs(shift[0])
