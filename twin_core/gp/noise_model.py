@@ -1,0 +1,238 @@
+"""Coloured noise of one sensor: Ornstein-Uhlenbeck plus white, fitted by maximum likelihood and used to whiten columns.
+
+A residual series is modelled as r(t) = o(t) + e, Cov(o(t), o(t')) = sigma_ou² exp(-|t - t'| / length), e white. Its
+one-state Kalman filter is at once the likelihood and the whitening: e[k] / sqrt(S[k]) is a row of L⁻¹ r with L the
+Cholesky factor of the series' covariance, in time linear in the number of samples.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.optimize import minimize
+
+from twin_core._typing import BoolArray, FloatArray
+from twin_core.errors import ModelError
+from twin_core.gp.kalman import LOG_2PI
+
+COLOUR_MUST_GAIN = 2.0
+"""Nats that the coloured part must gain over pure white noise: one per parameter (Akaike)."""
+LENGTH_STARTS = (2.0, 6.0, 20.0, 60.0, 200.0, 2000.0)
+"""First guesses of the correlation length, in sampling steps."""
+WHITE_STARTS = (1.0, 0.3)
+"""First guesses of the white part, as shares of what first differences show."""
+CLIMBS = 2
+"""Best starting points from which the likelihood is climbed."""
+
+
+@dataclass(frozen=True)
+class ResidualNoise:
+    """Ornstein-Uhlenbeck plus white noise of one sensor.
+
+    Attributes
+    ----------
+    sigma_ou
+        Standard deviation of the coloured part, 0 where the data do not support one; in the residual's unit.
+    length_s
+        Its correlation length.
+    sigma_white
+        Standard deviation of the white part.
+    log_likelihood
+        Of the series it was fitted to.
+    """
+
+    sigma_ou: float
+    length_s: float
+    sigma_white: float
+    log_likelihood: float
+
+    def whiten(self, time_s: FloatArray, columns: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
+        """Apply L⁻¹ to columns, L Lᵀ being this noise's covariance at the valid samples.
+
+        Parameters
+        ----------
+        time_s : (n_times,)
+            Strictly increasing.
+        columns : (n_times, n_columns)
+            Finite where valid.
+        valid : (n_times,)
+            Which samples were measured.
+
+        Returns
+        -------
+        (n_times, n_columns), float
+            Whitened columns, zero at invalid samples so that sums of products need no mask, and ln det of the covariance
+            of the valid samples.
+
+        Raises
+        ------
+        ModelError
+            Shapes differ, time does not increase, a valid sample is not finite, or the noise is zero.
+        """
+        times, values, mask = _checked(time_s, columns, valid)
+        if not self.sigma_ou**2 + self.sigma_white**2 > 0.0:
+            raise ModelError("the noise has no variance; give sigma_white a positive value")
+        out = np.zeros_like(values)
+        return out, _whiten(times, values, mask, self.sigma_ou**2, self.length_s, self.sigma_white**2, out)
+
+
+@njit(cache=True)
+def _whiten(
+    time_s: FloatArray,
+    columns: FloatArray,
+    valid: BoolArray,
+    colour: float,
+    length: float,
+    white: float,
+    out: FloatArray,
+) -> float:
+    """Filter every column with the gains of the one-state model; return ln det."""
+    n_times, n_columns = columns.shape
+    mean = np.zeros(n_columns)
+    variance, log_det, last, step, decay = colour, 0.0, -1, -1.0, 0.0
+    for k in range(n_times):
+        if not valid[k]:
+            continue
+        if last >= 0:
+            if time_s[k] - time_s[last] != step:
+                step = time_s[k] - time_s[last]
+                decay = np.exp(-step / length)
+            variance = decay * decay * variance + colour * (1.0 - decay * decay)
+            for c in range(n_columns):
+                mean[c] *= decay
+        last = k
+        total = variance + white
+        gain, scale = variance / total, 1.0 / np.sqrt(total)
+        for c in range(n_columns):
+            surprise = columns[k, c] - mean[c]
+            out[k, c] = surprise * scale
+            mean[c] += gain * surprise
+        variance = gain * white
+        log_det += np.log(total)
+    return log_det
+
+
+@njit(cache=True)
+def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> tuple[float, FloatArray]:
+    """Return the log-likelihood and its gradient in ln(sigma_ou), ln(length), ln(sigma_white)."""
+    colour, white = np.exp(2.0 * log_values[0]), np.exp(2.0 * log_values[2])
+    inverse_length = np.exp(-log_values[1])
+    d_colour = np.array([2.0 * colour, 0.0, 0.0])
+    d_white = np.array([0.0, 0.0, 2.0 * white])
+    mean, variance = 0.0, colour
+    d_mean, d_variance = np.zeros(3), d_colour.copy()
+    total, gradient = 0.0, np.zeros(3)
+    step, decay, d_decay = -1.0, 0.0, np.zeros(3)
+    for k in range(residual.size):
+        if k > 0:
+            if step_s[k - 1] != step:
+                step = step_s[k - 1]
+                decay = np.exp(-step * inverse_length)
+                d_decay[1] = decay * step * inverse_length
+            square = decay * decay
+            for p in range(3):
+                d_mean[p] = decay * d_mean[p] + d_decay[p] * mean
+                d_variance[p] = (
+                    square * d_variance[p]
+                    + 2.0 * decay * d_decay[p] * (variance - colour)
+                    + d_colour[p] * (1.0 - square)
+                )
+            mean *= decay
+            variance = square * variance + colour * (1.0 - square)
+        spread = variance + white
+        surprise, gain = residual[k] - mean, variance / spread
+        weighted = surprise / spread
+        total -= 0.5 * (LOG_2PI + np.log(spread) + surprise * weighted)
+        for p in range(3):
+            d_spread = d_variance[p] + d_white[p]
+            gradient[p] -= 0.5 * (d_spread / spread - weighted * weighted * d_spread) - weighted * d_mean[p]
+            d_gain = (d_variance[p] - gain * d_spread) / spread
+            d_mean[p] += d_gain * surprise - gain * d_mean[p]
+            d_variance[p] = d_gain * white + gain * d_white[p]
+        mean += gain * surprise
+        variance = gain * white
+    return total, gradient
+
+
+def fit(time_s: FloatArray, residual: FloatArray, *, white_floor: float) -> ResidualNoise:
+    """Fit the noise of one sensor by maximum likelihood.
+
+    Parameters
+    ----------
+    time_s : (n_times,)
+        Strictly increasing; any sampling.
+    residual : (n_times,)
+        Measured - modelled, of zero mean; NaN where missing.
+    white_floor
+        Smallest standard deviation of the white part (quantisation, declared noise), positive.
+
+    Returns
+    -------
+    ResidualNoise
+        Pure white (``sigma_ou = 0``) where the coloured part gains less than :data:`COLOUR_MUST_GAIN` nats.
+
+    Raises
+    ------
+    ModelError
+        No finite sample, time does not increase, or the floor is not positive.
+    """
+    if not white_floor > 0.0 or not np.isfinite(white_floor):
+        raise ModelError(f"white_floor must be positive, it is {white_floor}")
+    column = np.asarray(residual, dtype=np.float64)
+    seen = np.isfinite(column)
+    times, values, _ = _checked(time_s, np.where(seen, column, 0.0)[:, None] if column.ndim == 1 else column, seen)
+    if not seen.any():
+        raise ModelError("the residual has no finite sample to fit noise to")
+    times, series = times[seen], np.ascontiguousarray(values[seen, 0])
+    white = _fit_white(times, series, white_floor)
+    if series.size < 4:
+        return white
+    coloured = _fit_coloured(times, series, white_floor, white.sigma_white)
+    return coloured if coloured.log_likelihood > white.log_likelihood + COLOUR_MUST_GAIN else white
+
+
+def _fit_white(times: FloatArray, series: FloatArray, floor: float) -> ResidualNoise:
+    sigma = max(float(np.sqrt(np.mean(series**2))), floor)
+    total = -0.5 * float(np.sum(series**2)) / sigma**2 - series.size * (np.log(sigma) + 0.5 * LOG_2PI)
+    length = float(np.median(np.diff(times))) if times.size > 1 else 1.0
+    return ResidualNoise(0.0, length, sigma, float(total))
+
+
+def _fit_coloured(times: FloatArray, series: FloatArray, floor: float, spread: float) -> ResidualNoise:
+    """Climb from several lengths; bounds keep every parameter where the data can speak of it."""
+    steps = np.diff(times)
+    span, step = float(times[-1] - times[0]), float(np.median(steps))
+    bounds = [
+        (np.log(1e-3 * floor), np.log(30.0 * spread)),
+        (np.log(0.2 * steps.min()), np.log(10.0 * span)),
+        (np.log(floor), np.log(2.0 * spread)),
+    ]
+
+    def objective(point: FloatArray) -> tuple[float, FloatArray]:
+        total, gradient = _score(steps, series, point)
+        return -total / series.size, -gradient / series.size
+
+    differences = max(float(np.std(np.diff(series))) / np.sqrt(2.0), floor)
+    low, high = np.array(bounds).T
+    grid = [[spread, guess * step, share * differences] for guess in LENGTH_STARTS for share in WHITE_STARTS]
+    starts = sorted((np.clip(np.log(point), low, high) for point in grid), key=lambda point: objective(point)[0])
+    climbs = [
+        minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
+        for start in starts[:CLIMBS]
+    ]
+    best = min(climbs, key=lambda climb: float(climb.fun))
+    sigma_ou, length, sigma_white = np.exp(best.x)
+    return ResidualNoise(float(sigma_ou), float(length), float(sigma_white), float(-best.fun * series.size))
+
+
+def _checked(time_s: FloatArray, columns: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    times = np.ascontiguousarray(time_s, dtype=np.float64)
+    values = np.ascontiguousarray(columns, dtype=np.float64)
+    mask = np.ascontiguousarray(valid, dtype=np.bool_)
+    if times.ndim != 1 or values.ndim != 2 or values.shape[0] != times.size or mask.shape != times.shape:
+        raise ModelError(f"time has shape {times.shape}, columns {values.shape}, valid {mask.shape}: rows must agree")
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise ModelError("time must be finite and strictly increasing")
+    if not np.isfinite(values[mask]).all():
+        raise ModelError("a valid sample is not finite")
+    return times, values, mask
