@@ -5,7 +5,6 @@ does no harm (samples are recognised when they come again). Any other refusal ra
 """
 
 import asyncio
-import json
 import random
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
@@ -76,10 +75,8 @@ def _give_up(outcome: httpx.Response | httpx.TransportError, base_url: str, answ
     raise Unreachable(f"{base_url} does not answer ({outcome or type(outcome).__name__}); is the service running?")
 
 
-def _events(lines: Iterator[str]) -> Iterator[schemas.Message]:
-    for line in lines:
-        if line.startswith("data:"):
-            yield schemas.Message.model_validate(json.loads(line.removeprefix("data:")))
+def _event(line: str) -> schemas.Message | None:
+    return schemas.Message.model_validate_json(line.removeprefix("data:")) if line.startswith("data:") else None
 
 
 class TwinClient:
@@ -123,8 +120,6 @@ class TwinClient:
             outcome = self._try(call)
             if attempt >= self._retry.attempts or not _may_retry(call, outcome):
                 return _give_up(outcome, str(self._http.base_url), call.answer)
-            if isinstance(outcome, httpx.Response) and outcome.is_success:
-                return _read(outcome, call.answer)
             self._sleep_s(self._retry.pause_s(attempt))
             attempt += 1
 
@@ -244,7 +239,9 @@ class TwinClient:
             if not response.is_success:
                 response.read()
                 _read(response, schemas.Message)
-            yield from _events(response.iter_lines())
+            for line in response.iter_lines():
+                if (message := _event(line)) is not None:
+                    yield message
 
 
 class AsyncTwinClient:
@@ -282,8 +279,6 @@ class AsyncTwinClient:
             outcome = await self._try(call)
             if attempt >= self._retry.attempts or not _may_retry(call, outcome):
                 return _give_up(outcome, str(self._http.base_url), call.answer)
-            if isinstance(outcome, httpx.Response) and outcome.is_success:
-                return _read(outcome, call.answer)
             await asyncio.sleep(self._retry.pause_s(attempt))
             attempt += 1
 
@@ -313,5 +308,5 @@ class AsyncTwinClient:
                 await response.aread()
                 _read(response, schemas.Message)
             async for line in response.aiter_lines():
-                if line.startswith("data:"):
-                    yield schemas.Message.model_validate(json.loads(line.removeprefix("data:")))
+                if (message := _event(line)) is not None:
+                    yield message

@@ -16,7 +16,10 @@ START_NS = 1_767_225_600_123_456_000
 
 def columns() -> tuple[np.ndarray, dict[str, np.ndarray]]:
     time_ns = START_NS + np.arange(5, dtype=np.int64) * 10_000_000_000
-    return time_ns, {"T_px": np.array([290.0, np.nan, 291.5, 1e-9, -3.25]), "Q_px": np.array([np.nan, 12.0, np.nan, np.nan, 40.0])}
+    return time_ns, {
+        "T_px": np.array([290.0, np.nan, 291.5, 1e-9, -3.25]),
+        "Q_px": np.array([np.nan, 12.0, np.nan, np.nan, 40.0]),
+    }
 
 
 def test_round_trip_keeps_every_bit(tmp_path: Path) -> None:

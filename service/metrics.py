@@ -1,0 +1,68 @@
+"""Prometheus metrics of one application, in a registry of its own so that applications do not share numbers."""
+
+import time
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class Metrics:
+    """What the service counts."""
+
+    def __init__(self) -> None:
+        """Create every metric at zero."""
+        self.registry = CollectorRegistry()
+        self.requests = Counter(
+            "twin_http_requests", "Requests answered.", ("method", "route", "status"), registry=self.registry
+        )
+        self.duration_s = Histogram(
+            "twin_http_request_duration_seconds",
+            "Time to answer, by route.",
+            ("route",),
+            registry=self.registry,
+            buckets=(0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30),
+        )
+        self.samples = Counter(
+            "twin_ingest_samples", "Samples by what became of them.", ("twin", "outcome"), registry=self.registry
+        )
+        self.backlog = Gauge("twin_store_backlog", "Operations that wait for the writer.", registry=self.registry)
+        self.readers = Gauge("twin_stream_readers", "Open streams.", registry=self.registry)
+        self.dropped = Counter("twin_stream_dropped", "Messages that slow readers missed.", registry=self.registry)
+        self.jobs = Counter("twin_jobs", "Jobs that ended.", ("kind", "state"), registry=self.registry)
+        self.jobs_running = Gauge("twin_jobs_running", "Jobs that run now.", registry=self.registry)
+        self.assimilated = Counter("twin_assimilated_samples", "Samples that updated a state.", registry=self.registry)
+
+    def render(self) -> bytes:
+        """Return everything in the text format of Prometheus."""
+        return generate_latest(self.registry)
+
+
+class Observe:
+    """ASGI layer that counts and times every HTTP request by the template of its route."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        """Count into ``metrics``."""
+        self._app, self._metrics = app, metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on and note its status."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        status = 500
+        started_s = time.perf_counter()
+
+        async def watched(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, watched)
+        finally:
+            route = getattr(scope.get("route"), "path", "other")
+            self._metrics.requests.labels(scope["method"], route, str(status)).inc()
+            self._metrics.duration_s.labels(route).observe(time.perf_counter() - started_s)

@@ -1,0 +1,60 @@
+"""The registered twins in memory, so that no request waits for the database to learn which channels it may use."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from service.problems import Problem
+from service.store.twins import Twin
+from twin_core.network.spec import TwinSpec, load_spec
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What every route needs to know about a twin; none of it ever changes."""
+
+    key: int
+    name: str
+    channels: tuple[str, ...]
+    specification: dict[str, Any]
+
+    @cached_property
+    def spec(self) -> TwinSpec:
+        """The validated specification."""
+        return load_spec(self.specification)
+
+    @cached_property
+    def units(self) -> dict[str, str | None]:
+        """Channel -> unit."""
+        return {name: channel.get("unit") for name, channel in self.specification["channels"].items()}
+
+
+class Registry:
+    """Every registered twin by its name."""
+
+    def __init__(self, twins: Iterable[Twin]) -> None:
+        """Start with what the store holds."""
+        self._entries: dict[str, Entry] = {}
+        for twin in twins:
+            self.add(twin)
+
+    def add(self, twin: Twin) -> Entry:
+        """Take in a twin and return its entry."""
+        entry = Entry(twin.key, twin.name, twin.channels, twin.specification)
+        return self._entries.setdefault(twin.name, entry)
+
+    def remove(self, name: str) -> None:
+        """Forget a twin."""
+        self._entries.pop(name, None)
+
+    def get(self, name: str) -> Entry:
+        """Return one twin; Problem 404 if there is none of that name."""
+        try:
+            return self._entries[name]
+        except KeyError:
+            raise Problem(404, f"no twin '{name}' is registered") from None
+
+    def __iter__(self) -> Iterator[Entry]:
+        """Iterate over the twins."""
+        return iter(list(self._entries.values()))

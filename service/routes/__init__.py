@@ -1,0 +1,1 @@
+"""One thin router per resource: validate, call one function, shape the answer."""

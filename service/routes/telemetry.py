@@ -1,0 +1,128 @@
+"""Telemetry: take samples in, give the archive out."""
+
+import asyncio
+from typing import Annotated, Any
+
+import numpy as np
+import orjson
+from fastapi import APIRouter, Query, Request, Response
+
+from service.deps import NamedTwin, Running, Service, ingests, reads
+from service.downsample import extremes
+from service.frames import Batch, parse_columns, parse_frames
+from service.instants import format_instant, format_instants, parse_parameter
+from service.problems import BadField, Problem
+from service.registry import Entry
+from service.schemas import Archive, Columns, IngestReport
+from service.store import samples
+from service.store.samples import Receipt, Samples
+
+router = APIRouter(prefix="/v1/twins/{twin}/telemetry", tags=["telemetry"])
+
+NDJSON = "application/x-ndjson"
+PARSE_APART_BYTES = 512 * 1024
+"""Larger bodies are parsed in a thread, so that other requests are answered meanwhile."""
+MOST_POINTS = 200_000
+
+_FRAME = {"type": "string", "description": 'One {"time": ..., "values": {...}} per line.'}
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/json": {"schema": Columns.model_json_schema()}, NDJSON: {"schema": _FRAME}},
+    }
+}
+
+
+@router.post("", dependencies=[ingests], response_model=IngestReport, openapi_extra=_BODY)
+async def ingest(request: Request, service: Running, twin: NamedTwin) -> Response:
+    """Store samples durably, then answer what became of each; a malformed body is refused whole."""
+    body = await request.body()
+    parse = _parser(request.headers.get("content-type", ""))
+    if len(body) > PARSE_APART_BYTES:
+        batch = await asyncio.to_thread(parse, body, twin.channels)
+    else:
+        batch = parse(body, twin.channels)
+    try:
+        receipt = await service.database.write(samples.append, twin.key, batch)
+    except LookupError:
+        raise Problem(404, f"no twin '{twin.name}' is registered") from None
+    _count(service, twin, batch, receipt)
+    return Response(orjson.dumps(_report(receipt, batch)), media_type="application/json")
+
+
+def _parser(content_type: str) -> Any:
+    media = content_type.partition(";")[0].strip().lower()
+    if media == "application/json":
+        return parse_columns
+    if media in (NDJSON, "application/ndjson", "application/jsonl"):
+        return parse_frames
+    raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{media[:60]}'")
+
+
+def _report(receipt: Receipt, batch: Batch) -> dict[str, Any]:
+    conflicts = receipt.conflicts
+    return {
+        "accepted": int(receipt.stored.sum()),
+        "duplicates": receipt.duplicates,
+        "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
+        "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
+    }
+
+
+def _count(service: Service, twin: Entry, batch: Batch, receipt: Receipt) -> None:
+    n_conflicts = len(receipt.conflicts)
+    count = service.metrics.samples.labels
+    count(twin.name, "accepted").inc(batch.time_us.size - n_conflicts - receipt.duplicates)
+    count(twin.name, "duplicate").inc(receipt.duplicates)
+    count(twin.name, "rejected").inc(n_conflicts)
+
+
+@router.get("", dependencies=[reads], response_model=Archive)
+async def archive(
+    service: Running,
+    twin: NamedTwin,
+    start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
+    stop: Annotated[str | None, Query(description="First instant after the last one wanted.")] = None,
+    channels: Annotated[str | None, Query(description="Channels separated by commas; absent: all.")] = None,
+    max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
+) -> Response:
+    """Return start <= time < stop as columns; beyond ``max_points`` only samples that hold extremes."""
+    names = _named(channels, twin)
+    start_us, stop_us = span(start, stop)
+    rows = [twin.channels.index(name) for name in names]
+    found = await service.database.read(samples.select, twin.key, len(twin.channels), rows, start_us, stop_us)
+    document = await asyncio.to_thread(_render, found, names, twin, max_points)
+    return Response(document, media_type="application/json")
+
+
+def span(start: str | None, stop: str | None) -> tuple[int | None, int | None]:
+    """Return the instants of an interval in microseconds; BadField if it is empty."""
+    start_us = None if start is None else parse_parameter(start, "start")
+    stop_us = None if stop is None else parse_parameter(stop, "stop")
+    if start_us is not None and stop_us is not None and start_us > stop_us:
+        raise BadField("stop", "comes before start")
+    return start_us, stop_us
+
+
+def _named(channels: str | None, twin: Entry) -> list[str]:
+    if channels is None:
+        return list(twin.channels)
+    names = list(dict.fromkeys(name.strip() for name in channels.split(",")))
+    for name in names:
+        if name not in twin.channels:
+            raise BadField("channels", f"unknown channel '{name}' (known: {', '.join(twin.channels)})")
+    return names
+
+
+def _render(found: Samples, names: list[str], twin: Entry, max_points: int) -> bytes:
+    kept = extremes(found.values, max_points)
+    values = found.values[:, kept]
+    columns = {name: np.ascontiguousarray(values[row]) for row, name in enumerate(names)}
+    document = {
+        "time": format_instants(found.time_us[kept]),
+        "values": columns,  # orjson writes NaN as null
+        "units": {name: twin.units[name] for name in names},
+        "samples": int(found.time_us.size),
+        "downsampled": kept.size < found.time_us.size,
+    }
+    return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)

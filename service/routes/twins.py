@@ -1,0 +1,65 @@
+"""Twins: register, list, inspect, delete."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Response
+
+from service.deps import NamedTwin, Running, operates, reads
+from service.instants import format_instant
+from service.schemas import TwinDetail, TwinInfo, TwinList
+from service.store import twins
+from service.store.twins import Twin
+from twin_core.network.spec import dump_spec, load_spec
+
+router = APIRouter(prefix="/v1/twins", tags=["twins"])
+
+
+def _when(instant_us: int | None) -> str | None:
+    return None if instant_us is None else format_instant(instant_us)
+
+
+def _info(twin: Twin) -> dict[str, Any]:
+    return {
+        "id": twin.name,
+        "created": format_instant(twin.created_us),
+        "samples": twin.samples,
+        "first_time": _when(twin.first_us),
+        "last_time": _when(twin.last_us),
+        "active_model": twin.active_version,
+        "seq": twin.seq,
+        "channels": list(twin.channels),
+    }
+
+
+def _detail(twin: Twin) -> TwinDetail:
+    return TwinDetail(**_info(twin), specification=twin.specification)
+
+
+@router.post("", status_code=201, dependencies=[operates])
+async def register(service: Running, response: Response, body: Annotated[dict[str, Any], Body()]) -> TwinDetail:
+    """Register a specification (201); the identical one again answers 200, another one under its id 409."""
+    spec = load_spec(body)
+    twin, is_new = await service.database.write(twins.register, spec.twin, dump_spec(spec))
+    service.registry.add(twin)
+    response.status_code = 201 if is_new else 200
+    response.headers["Location"] = f"/v1/twins/{twin.name}"
+    return _detail(twin)
+
+
+@router.get("", dependencies=[reads])
+async def list_twins(service: Running) -> TwinList:
+    """List every twin."""
+    return TwinList(twins=[TwinInfo(**_info(twin)) for twin in await service.database.read(twins.select)])
+
+
+@router.get("/{twin}", dependencies=[reads])
+async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
+    """Return one twin with its specification."""
+    return _detail(await service.database.read(twins.get, twin.name))
+
+
+@router.delete("/{twin}", status_code=204, dependencies=[operates])
+async def delete(service: Running, twin: NamedTwin) -> None:
+    """Delete a twin with its archive, models and jobs."""
+    service.registry.remove(twin.name)
+    await service.database.write(twins.delete, twin.name)

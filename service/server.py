@@ -1,0 +1,76 @@
+"""The running server: the application behind uvicorn, shut down without losing what was acknowledged."""
+
+import contextlib
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from service.app import create_app
+from service.settings import Settings
+from service.store.database import Database
+from twin_core.errors import TwinError
+
+SHUTDOWN_S = 10
+
+
+class ServerError(TwinError):
+    """The server cannot start."""
+
+
+def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> None:
+    """Serve until interrupted.
+
+    Parameters
+    ----------
+    settings
+        Where to listen and what to use; port 0 picks a free one.
+    on_ready
+        Called with the URL once the service answers.
+
+    Raises
+    ------
+    ServerError, StoreError
+        If the address or the database cannot be used.
+    """
+    listener = _listen(settings)
+    database = Database(settings.database_path)
+    host, port = listener.getsockname()[:2]
+    config = uvicorn.Config(
+        create_app(settings, database),
+        log_config=None,
+        access_log=False,
+        ws="websockets-sansio",
+        lifespan="on",
+        timeout_keep_alive=30,
+        timeout_graceful_shutdown=SHUTDOWN_S,
+        server_header=False,
+    )
+    server = _Server(config, on_ready, f"http://{f'[{host}]' if ':' in host else host}:{port}")
+    with contextlib.suppress(KeyboardInterrupt), listener:  # raised again once everything is closed in good order
+        server.run(sockets=[listener])
+
+
+def _listen(settings: Settings) -> socket.socket:
+    try:
+        family, kind, number, _, address = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0]
+        listener = socket.socket(family, kind, number)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise ServerError(f"TWIN_HOST {settings.host}, TWIN_PORT {settings.port}: {reason}; choose another") from error
+    return listener
+
+
+class _Server(uvicorn.Server):
+    """A server that tells when it is ready."""
+
+    def __init__(self, config: uvicorn.Config, on_ready: Callable[[str], None] | None, url: str) -> None:
+        super().__init__(config)
+        self._on_ready, self._url = on_ready, url
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        if not self.should_exit and self._on_ready is not None:
+            self._on_ready(self._url)
