@@ -75,9 +75,10 @@ async def _on_http(request: Request, error: Exception) -> Response:
 
 async def _on_validation(_: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
+    if any(item["type"] == "json_invalid" for item in error.errors()):
+        return problem(400, "body: not valid JSON", [("body", "not valid JSON")])
     errors = [(_field(item["loc"]), item["msg"].removeprefix("Value error, ")) for item in error.errors()]
-    status = 400 if any(item["type"] == "json_invalid" for item in error.errors()) else 422
-    return problem(status, "; ".join(f"{field}: {reason}" for field, reason in errors[:3]), errors)
+    return problem(422, "; ".join(f"{field}: {reason}" for field, reason in errors[:3]), errors)
 
 
 def _field(location: Sequence[str | int]) -> str:

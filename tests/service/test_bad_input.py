@@ -1,0 +1,142 @@
+"""Wrong requests: each one a 4xx problem document that names the field, with nothing stored."""
+
+import gzip
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from tests.service.harness import AppClient
+
+TELEMETRY = "/v1/twins/benchsat/telemetry"
+JSON = "application/json"
+NDJSON = "application/x-ndjson"
+
+
+@dataclass(frozen=True)
+class Case:
+    """A request, and what its refusal must say."""
+
+    name: str
+    body: bytes | str | dict | list
+    status: int
+    says: str
+    path: str = TELEMETRY
+    method: str = "POST"
+    kind: str = JSON
+    headers: dict[str, str] = field(default_factory=dict)
+
+    def content(self) -> bytes:
+        body = self.body if isinstance(self.body, bytes | str) else json.dumps(self.body)
+        return body.encode() if isinstance(body, str) else body
+
+
+def columns(time: Any, **values: Any) -> dict:
+    return {"time": time, "values": values}
+
+
+def spec_with(**changes: Any) -> dict:
+    """A specification of another twin, with some fields replaced."""
+    return {
+        "twin": "other",
+        "channels": {"T": {"kind": "temperature", "unit": "K"}},
+        "nodes": [{"id": "a", "sensor": "T"}],
+        **changes,
+    }
+
+
+INGEST = [
+    Case("empty body", "", 400, "body"),
+    Case("not JSON", "time,T_px\n1,2", 400, "body"),
+    Case("half a document", '{"time": [1], "values": {"T_px": [1', 400, "body"),
+    Case("invalid UTF-8", b'{"time": [1], "values": {"\xff": [1]}}', 400, "body"),
+    Case("endless nesting", "[" * 100_000, 400, "body"),
+    Case("a list", [], 422, "body"),
+    Case("no time", {"values": {}}, 422, "time"),
+    Case("no values", {"time": []}, 422, "values"),
+    Case("an unknown member", {"time": [], "values": {}, "x": 1}, 422, "x"),
+    Case("time is a number", columns(1, T_px=[1]), 422, "time"),
+    Case("values is a list", {"time": [1], "values": [1]}, 422, "values"),
+    Case("a column is a number", columns([1], T_px=1), 422, "values.T_px"),
+    Case("a short column", columns([1, 2], T_px=[1]), 422, "values.T_px"),
+    Case("a long column", columns([1], T_px=[1, 2]), 422, "values.T_px"),
+    Case("an unknown channel", columns([1], T_py=[1]), 422, "values.T_py"),
+    Case("NaN", '{"time": [1, 2], "values": {"T_px": [1, NaN]}}', 422, "values.T_px[1]"),
+    Case("minus infinity", '{"time": [1], "values": {"T_px": [-Infinity]}}', 422, "values.T_px[0]"),
+    Case("an overflowing number", '{"time": [1], "values": {"T_px": [1e999]}}', 422, "values.T_px[0]"),
+    Case("text for a number", columns([1], T_px=["290"]), 422, "values.T_px[0]"),
+    Case("true for a number", columns([1, 2], T_px=[290, True]), 422, "values.T_px[1]"),
+    Case("a list for a number", columns([1], T_px=[[1]]), 422, "values.T_px[0]"),
+    Case("an object for a number", columns([1], T_px=[{}]), 422, "values.T_px[0]"),
+    Case("a time that is none", columns(["yesterday"], T_px=[1]), 422, "time[0]"),
+    Case("a null time", columns([1, None], T_px=[1, 2]), 422, "time[1]"),
+    Case("a true time", columns([True], T_px=[1]), 422, "time[0]"),
+    Case("a NaN time", '{"time": [NaN], "values": {"T_px": [1]}}', 422, "time[0]"),
+    Case("a time without offset", columns(["2026-01-01T00:00:00"], T_px=[1]), 422, "time[0]"),
+    Case("a date without time", columns(["2026-01-01"], T_px=[1]), 422, "time[0]"),
+    Case("February 30", columns(["2026-02-30T00:00:00Z"] * 40, T_px=[1] * 40), 422, "time[0]"),
+    Case("hour 24", columns(["2026-02-03T24:00:00Z"], T_px=[1]), 422, "time[0]"),
+    Case("milliseconds for seconds", columns([1767225600000], T_px=[1]), 422, "time[0]"),
+    Case("a time before 1970", columns([-1], T_px=[1]), 422, "time[0]"),
+    Case("the year 9999", columns(["9999-12-31T23:59:59Z"], T_px=[1]), 422, "time[0]"),
+    Case("the year 1", columns(["0001-01-01T00:00:00Z"], T_px=[1]), 422, "time[0]"),
+    Case("a wrong media type", columns([1]), 415, "content-type", kind="text/csv"),
+    Case("a wrong encoding", columns([1]), 415, "gzip", headers={"content-encoding": "br"}),
+    Case("not gzip", columns([1]), 400, "gzip", headers={"content-encoding": "gzip"}),
+    Case("half a gzip", gzip.compress(b"{}" * 99)[:-9], 400, "gzip", headers={"content-encoding": "gzip"}),
+    Case("a body too large", b" " * 70_000, 413, "smaller batches"),
+    Case("a gzip bomb", gzip.compress(b" " * 10_000_000), 413, "smaller", headers={"content-encoding": "gzip"}),
+    Case("frame not JSON", '{"time": 1, "values": {}}\n{"time"', 400, "line 2", kind=NDJSON),
+    Case("frame is a list", "[]", 422, "line 1", kind=NDJSON),
+    Case("two frames in a line", '{"time": 1, "values": {}},{"time": 2, "values": {}}', 400, "line 1", kind=NDJSON),
+    Case("frame with a strange channel", '{"time": 1, "values": {"X": 1}}', 422, "line 1: values.X", kind=NDJSON),
+    Case("frame with text", '{"time": 1, "values": {"T_px": "1"}}', 422, "line 1: values.T_px", kind=NDJSON),
+    Case("frame with infinity", '{"time": 1, "values": {"T_px": Infinity}}', 422, "line 1: values.T_px", kind=NDJSON),
+    Case("frame without time", '{"values": {}}', 422, "line 1: time", kind=NDJSON),
+    Case(
+        "frame with a bad time",
+        '{"time": 1, "values": {}}\n{"time": "x", "values": {}}',
+        422,
+        "line 2: time",
+        kind=NDJSON,
+    ),
+]
+
+ELSEWHERE = [
+    Case("no such twin", columns([1]), 404, "nosuch", path="/v1/twins/nosuch/telemetry"),
+    Case("no such route", "", 404, "/v1/nothing", path="/v1/nothing", method="GET"),
+    Case("no such method", "", 405, "PUT", path="/v1/twins", method="PUT"),
+    Case("query: start", "", 422, "start", path=TELEMETRY + "?start=noon", method="GET"),
+    Case("query: stop before start", "", 422, "stop", path=TELEMETRY + "?start=9&stop=3", method="GET"),
+    Case("query: stop out of range", "", 422, "stop", path=TELEMETRY + "?stop=1e300", method="GET"),
+    Case("query: NaN", "", 422, "stop", path=TELEMETRY + "?stop=nan", method="GET"),
+    Case("query: channel", "", 422, "channels", path=TELEMETRY + "?channels=T_px,T", method="GET"),
+    Case("query: one point", "", 422, "max_points", path=TELEMETRY + "?max_points=1", method="GET"),
+    Case("spec: not JSON", "{", 400, "body", path="/v1/twins"),
+    Case("spec: a list", [], 422, "body", path="/v1/twins"),
+    Case("spec: no nodes", spec_with(nodes=[]), 422, "nodes", path="/v1/twins"),
+    Case("spec: bad id", spec_with(twin="Other Twin"), 422, "twin", path="/v1/twins"),
+    Case("spec: unknown field", spec_with(colour="red"), 422, "colour", path="/v1/twins"),
+    Case(
+        "spec: unknown sensor", spec_with(nodes=[{"id": "a", "sensor": "X"}]), 422, "nodes[0].sensor", path="/v1/twins"
+    ),
+    Case("spec: NaN", '{"twin": "other", "boundaries": {"space": {"value_K": NaN}}}', 422, "value_K", path="/v1/twins"),
+    Case("spec: other under this id", spec_with(twin="benchsat"), 409, "benchsat", path="/v1/twins"),
+]
+
+
+@pytest.mark.parametrize("case", INGEST + ELSEWHERE, ids=lambda case: case.name)
+def test_wrong_request_is_refused_by_name(make_client, spec: dict, case: Case) -> None:
+    client: AppClient = make_client(max_body_bytes=65_536 * 2 if "nesting" in case.name else 65_536)
+    client.post("/v1/twins", json=spec)
+    client.post(TELEMETRY, json=columns([5], T_px=[1]))
+    headers = {"content-type": case.kind, **case.headers}
+    response = client.request(case.method, case.path, content=case.content(), headers=headers)
+    assert response.status_code == case.status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert problem["status"] == case.status
+    assert case.says in problem["detail"] or case.says in json.dumps(problem.get("errors", []))
+    assert client.get(TELEMETRY).json()["samples"] == 1
+    assert len(client.get("/v1/twins").json()["twins"]) == 1
