@@ -123,7 +123,7 @@ def _forcings(rng: np.random.Generator) -> dict[str, Any]:
         }
         for channel, node in SUNS.items()
     }
-    levels = {"Q_pz": (10, 60, 120), "Q_box": (30, 80, 150), "Q_battery": (15, 45, 90), "Q_tank": (0, 25, 50)}
+    levels = {"Q_pz": (10, 60, 120), "Q_box": (30, 80, 150), "Q_battery": (15, 45, 90), "Q_tank": (0, 40, 90)}
     for channel, values in levels.items():
         signal = {"signal": "telegraph", "levels": values, "dwell_s": float(rng.uniform(2500.0, 5000.0))}
         forcings[channel] = {"kind": "power", "unit": "W", "signal": signal}
@@ -243,7 +243,7 @@ def _by_channel(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any
 
 def _heater(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
     # Set points lie a little above the usual mean of each node, so that the heater is at work part of the time.
-    usual_K = {"px": 263.0, "mx": 260.0, "pz": 274.0, "box": 294.0, "battery": 279.0, "tank": 280.0}
+    usual_K = {"px": 264.0, "mx": 262.0, "pz": 274.0, "box": 294.0, "battery": 283.0, "tank": 287.0}
     node = _pick(rng, *NODES)
     set_K = usual_K[node] + float(rng.uniform(0.0, 4.0))
     power_W = float(rng.uniform(30.0, 60.0))
@@ -251,7 +251,7 @@ def _heater(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
 
 
 def _gain(rng: np.random.Generator, body: dict[str, Any]) -> dict[str, Any]:
-    g = rng.uniform(0.5, 0.75) if rng.random() < 0.6 else rng.uniform(1.25, 1.5)
+    g = rng.uniform(0.4, 0.65) if rng.random() < 0.6 else rng.uniform(1.35, 1.6)
     return {"channel": _pick(rng, *PAYLOADS, *SUNS), "g": float(g)}
 
 
