@@ -209,11 +209,11 @@ class Problem:
                     self.network, values, segment.forcing, path, starts, self.n_free, self.network.sensor_node
                 )
             ]
-            blocks.append(self._with_readings(values, segment, np.concatenate(parts)))
+            blocks.append(self.with_reading_derivatives(values, segment, np.concatenate(parts)))
         return blocks
 
-    def _with_readings(self, values: FloatArray, segment: Segment, block: FloatArray) -> FloatArray:
-        """Add the derivatives of sensor faults."""
+    def with_reading_derivatives(self, values: FloatArray, segment: Segment, block: FloatArray) -> FloatArray:
+        """Return sensitivities with the derivatives of sensor faults added, (n_samples, n_sensors, n_columns)."""
         parameters = self.network.parameters
         position = {int(index): k for k, index in enumerate(parameters.free_index)}
         at = parameters.at_values(values)

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.problem import Problem
-from twin_core.gp.noise_model import ResidualNoise, fit, whiten
+from twin_core.gp.noise_model import ResidualNoise, fit
 
 SEPARATION = 1.0e3
 """Segments are laid this many record lengths apart, so that their residuals are independent."""
@@ -39,7 +39,7 @@ class Whitener:
         """Return whitened columns, (n_valid, n_columns), from (n_rows, n_sensors, n_columns)."""
         parts = []
         for s, model in enumerate(self.models):
-            whitened, _ = whiten(model, self.time_s, np.ascontiguousarray(columns[:, s]), self.valid[:, s])
+            whitened, _ = model.whiten(self.time_s, np.ascontiguousarray(columns[:, s]), self.valid[:, s])
             parts.append(whitened[self.valid[:, s]])
         return np.concatenate(parts)
 

@@ -87,10 +87,11 @@ def fit_network(
     network = build_network(spec, effects, table_knots=table_levels(spec, records))
     step = 1.5 * sampling_step_s(records)
     problem = build_problem(network, records, noise, step)
+    problem = problem.with_network(network.with_parameters(balance_start(problem)))
     progress(0.05, "calibrating")
     optimum = _best_start(problem, progress)
     for halving in range(MAX_HALVINGS):
-        finer = build_problem(problem.network, records, noise, step / 2.0 / 1.5)
+        finer = build_problem(problem.network, records, noise, step / 2.0)
         if _step_error(problem, finer, optimum) < STEP_ERROR_SHARE:
             break
         step, problem = step / 2.0, finer
@@ -119,11 +120,9 @@ def _step_error(problem: Problem, finer: Problem, optimum: Optimum) -> float:
 
 def _best_start(problem: Problem, progress: Progress) -> Optimum:
     """Return the best optimum from the declared guesses, and from scattered ones where guesses are missing."""
-    start = balance_start(problem)
-    unknowns = problem.start()
-    unknowns[: problem.n_free] = start.free
-    best = minimise(problem.with_network(problem.network.with_parameters(start)), unknowns)
-    guessed = np.array([start.parameters[i].guessed for i in start.free_index], dtype=np.bool_)
+    best = minimise(problem)
+    parameters, unknowns = problem.network.parameters, problem.start()
+    guessed = np.array([parameters.parameters[i].guessed for i in parameters.free_index], dtype=np.bool_)
     if not guessed.any():
         return best
     generator = np.random.default_rng(0)
@@ -131,7 +130,7 @@ def _best_start(problem: Problem, progress: Progress) -> Optimum:
         progress(0.1 + 0.15 * trial, "calibrating from other starting points")
         scattered = unknowns.copy()
         scattered[: problem.n_free][guessed] += generator.normal(0.0, 1.0, int(guessed.sum()))
-        other = minimise(problem.with_network(problem.network.with_parameters(start)), scattered, max_iterations=40)
+        other = minimise(problem, scattered, max_iterations=40)
         if other.fit.cost < best.fit.cost:
             best = other
     return best

@@ -46,20 +46,34 @@ def table_levels(spec: TwinSpec, records: Sequence[Record]) -> dict[tuple[str, s
     }
 
 
-def filled_temperatures(network: Network, segment: Segment) -> FloatArray:
+def filled_columns(
+    network: Network, time_s: FloatArray, measured_K: FloatArray, start_K: FloatArray | None
+) -> FloatArray:
     """Return a temperature for every state at the samples, (n_samples, n_nodes), interpolated over gaps.
 
-    A state without a sensor gets the mean of the states that a conductor joins it to, else of all.
+    Parameters
+    ----------
+    network
+        Tells which sensor reads which state, and which states a conductor joins.
+    time_s : (n_samples,)
+    measured_K : (n_samples, n_sensors)
+        NaN where missing.
+    start_K : (n_nodes,)
+        Where given, a state without any reading keeps this temperature; else it gets the mean of the states that a
+        conductor joins it to, or of all.
     """
-    time_s, n_nodes = segment.record.time_s, len(network.nodes)
-    filled = np.full((time_s.size, n_nodes), np.nan)
+    filled = np.full((time_s.size, len(network.nodes)), np.nan)
     for sensor, node in enumerate(network.sensor_node):
-        column = segment.measured_K[:, sensor]
+        column = measured_K[:, sensor]
         valid = np.isfinite(column)
         if valid.any():
             filled[:, node] = np.interp(time_s, time_s[valid], column[valid])
     known = np.isfinite(filled[0])
+    if start_K is not None:
+        filled[:, ~known] = start_K[~known]
+        return filled
     pairs = [(network.nodes.index(a), network.nodes.index(b)) for a, b in _inner_pairs(network)]
+    pairs += [(network.layout.node(extra.name), network.layout.node(extra.like)) for extra in network.extra]
     for node in np.flatnonzero(~known):
         near = [b if a == node else a for a, b in pairs if node in (a, b)]
         sources = [n for n in near if known[n]] or list(np.flatnonzero(known))
@@ -75,7 +89,7 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
     """Return the integrated balances of one segment: (n_windows * n_nodes, n_parameters) and known heat (rows,)."""
     network, forcing = problem.network, segment.forcing
     values = network.parameters.values
-    temperatures = filled_temperatures(network, segment)
+    temperatures = filled_columns(network, segment.record.time_s, segment.measured_K, None)
     after = np.concatenate([temperatures[1:], temperatures[-1:]])
     counts = np.diff(forcing.sample_step)
     stages = np.repeat(after[:-1], counts, axis=0)
@@ -98,7 +112,7 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
         for entry in part.d_values:
             design[:, entry.node, index[entry.index]] += integrated(entry.series)
     edges = np.searchsorted(window, np.arange(n_windows + 1))
-    at_edges = np.concatenate([temperatures[:1], temperatures])[np.searchsorted(forcing.sample_step, edges) + 1 - 1]
+    at_edges = temperatures[np.searchsorted(forcing.sample_step, edges)]
     for node, index in enumerate(network.capacity_index):
         design[:, node, index] -= np.diff(at_edges[:, node])
     frozen = np.array([p.frozen for p in network.parameters.parameters])

@@ -102,6 +102,10 @@ class Effect(ABC):
     equation: ClassVar[str]
     reference: ClassVar[str]
     words: ClassVar[str]
+    reported_settings: ClassVar[tuple[str, ...]] = ()
+    """Settings that the report lists beside the parameters, such as knots."""
+    fallback: ClassVar[bool] = False
+    """True for an effect that is tried only where no named one is supported."""
 
     @abstractmethod
     def qualities(self) -> tuple[Quality, ...]:

@@ -20,6 +20,7 @@ class ChannelHeatLoad(Effect):
     equation = "q = f(x)"
     reference = "Solar heat by pitch in the Chandra thermal models (Aldcroft, Xija documentation)"
     words = "receives heat that follows {channel}"
+    reported_settings = ("knots",)
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the heat at each knot."""

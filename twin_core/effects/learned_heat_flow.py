@@ -46,6 +46,8 @@ class LearnedHeatFlow(Effect):
     equation = "q = sum_k c_k ((T - T_c) / T_w)^k"
     reference = "Kouw et al., CCTA 2024, section III-C"
     words = "receives a heat that repeats with its temperature but fits no named effect"
+    reported_settings = ("degree",)
+    fallback = True
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the coefficients, in W."""

@@ -45,7 +45,14 @@ def fill_boundaries(network: Network, values: FloatArray, boundaries_K: FloatArr
     return filled
 
 
-def evaluate_balance(network: Network, values: FloatArray, along: Along, *, derivatives: bool = False) -> Balance:
+def evaluate_balance(
+    network: Network,
+    values: FloatArray,
+    along: Along,
+    *,
+    derivatives: bool = False,
+    extra_W: FloatArray | None = None,
+) -> Balance:
     """Evaluate the heat balance of a network.
 
     Parameters
@@ -58,6 +65,8 @@ def evaluate_balance(network: Network, values: FloatArray, along: Along, *, deri
         The points; its boundaries must be filled.
     derivatives
         Whether to return the parameter derivatives too.
+    extra_W : (n_points, n_nodes)
+        Heat beyond the terms.
 
     Returns
     -------
@@ -65,7 +74,7 @@ def evaluate_balance(network: Network, values: FloatArray, along: Along, *, deri
         C_i dT_i/dt = sum of the terms' heats into node i.
     """
     n_points, n_nodes = along.temperatures_K.shape
-    heat = np.zeros((n_points, n_nodes))
+    heat = np.zeros((n_points, n_nodes)) if extra_W is None else extra_W.astype(np.float64)
     jacobian = np.zeros((n_points, n_nodes, n_nodes))
     entries: list[Entry] = []
     for term, index in zip(network.terms, network.term_indices, strict=True):

@@ -125,13 +125,18 @@ def balance_along(
     last: int,
     *,
     derivatives: bool = False,
+    extra_W: FloatArray | None = None,
 ) -> Balance:
-    """Evaluate the heat balance at the stages of steps first..last-1, flattened to (2 n_steps, ...)."""
+    """Evaluate the heat balance at the stages of steps first..last-1, flattened to (2 n_steps, ...).
+
+    ``extra_W`` (n_steps, n_nodes) is heat beyond the network's terms; a capacity answers to it as to any other.
+    """
     boundaries = forcing.boundaries_K[first:last].reshape(-1, forcing.boundaries_K.shape[2])
     along = forcing.along(
         stages_K.reshape(-1, stages_K.shape[2]), fill_boundaries(network, values, boundaries), first, last
     )
-    return evaluate_balance(network, values, along, derivatives=derivatives)
+    extra = None if extra_W is None else np.repeat(extra_W, 2, axis=0)
+    return evaluate_balance(network, values, along, derivatives=derivatives, extra_W=extra)
 
 
 def sensitivities(

@@ -1,0 +1,119 @@
+"""The hold-out: an open-loop rollout from one initial state, never corrected, that no choice has seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.assimilate import assimilate
+from twin_core.calibrate.problem import measured_temperatures
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.errors import TelemetryError
+from twin_core.simulate.forcing import build_forcing
+from twin_core.simulate.rollout import rollout
+from twin_core.telemetry import Record
+
+DEFAULT_BURN_IN_SHARE = 0.05
+MIN_BURN_IN_SAMPLES = 10
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A stretch of telemetry to be predicted, and the telemetry before it that tells the initial state.
+
+    Attributes
+    ----------
+    lead
+        Telemetry up to and including the sample from which the rollout starts.
+    scored
+        That sample and everything after it; the first sample is not scored.
+    """
+
+    lead: Record
+    scored: Record
+
+
+def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Record], list[HeldOut]]:
+    """Split the last ``fraction`` of the record's time span off.
+
+    Parameters
+    ----------
+    records
+        Segments in order; several segments are split by their summed spans.
+    fraction
+        Between 0 and 1, exclusive.
+
+    Returns
+    -------
+    train, holdout
+        Segments for every fit and choice; what is predicted.
+
+    Raises
+    ------
+    TelemetryError
+        If either part would be empty.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise TelemetryError(f"holdout: must be between 0 and 1, exclusive (got {fraction:g})")
+    spans = np.array([float(r.time_s[-1] - r.time_s[0]) for r in records])
+    kept = (1.0 - fraction) * spans.sum()
+    train: list[Record] = []
+    held: list[HeldOut] = []
+    for record, span in zip(records, spans, strict=True):
+        cut = float(record.time_s[0]) + min(max(kept, 0.0), span)
+        before = record.time_s <= cut + 1e-9
+        if kept >= span:
+            train.append(record)
+        elif kept <= 0.0:
+            held.append(split_burn_in(record, None))
+        else:
+            if before.sum() < MIN_BURN_IN_SAMPLES or (~before).sum() < 3:
+                raise TelemetryError(f"{record.name}: too few samples to hold {fraction:.0%} back")
+            lead = record.take(before)
+            train.append(lead)
+            held.append(HeldOut(lead, record.take(np.arange(record.time_s.size) >= before.sum() - 1)))
+        kept -= span
+    if not train or not held:
+        raise TelemetryError(f"holdout: {fraction:g} leaves nothing to train on or nothing to predict")
+    return train, held
+
+
+def split_burn_in(record: Record, burn_in_s: float | None) -> HeldOut:
+    """Return a separate hold-out record whose first seconds tell the initial state and are not scored.
+
+    Without ``burn_in_s`` 5 % of the span are used, at least ten samples. Raises TelemetryError if nothing would be left.
+    """
+    span = float(record.time_s[-1] - record.time_s[0])
+    seconds = DEFAULT_BURN_IN_SHARE * span if burn_in_s is None else burn_in_s
+    last = int(np.searchsorted(record.time_s, record.time_s[0] + seconds, side="right"))
+    if burn_in_s is None:
+        last = max(last, MIN_BURN_IN_SAMPLES)
+    last = max(last, 1)
+    if record.time_s.size - last < 2:
+        raise TelemetryError(f"{record.name}: nothing is left to score after a burn-in of {seconds:g} s")
+    return HeldOut(record.take(np.arange(record.time_s.size) < last), record.take(np.arange(record.time_s.size) >= last - 1))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Measured and predicted readings of one hold-out stretch, (n_samples, n_sensors) in K; the start is left out."""
+
+    time_s: FloatArray
+    measured_K: FloatArray
+    predicted_K: FloatArray
+
+
+def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
+    """Roll a model out over a hold-out stretch from the state filtered at the end of its lead."""
+    network = model.network()
+    values = network.parameters.values
+    state = assimilate(model, held.lead).mean_K
+    forcing = build_forcing(network, held.scored, model.max_step_s)
+    path = rollout(network, values, state, forcing)
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node].copy()
+    for term in network.readings:
+        part = term.evaluate(held.scored.time_s, values[network.term_index(term)])
+        read[:, part.sensor] += part.offset_K
+    measured = measured_temperatures(model.spec, held.scored)
+    return Prediction(held.scored.time_s[1:], measured[1:], read[1:])

@@ -1,0 +1,111 @@
+"""The closed loop: calibrate, find what is missing, add it, and measure on telemetry that no choice has seen."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from twin_core._typing import Json, Progress, no_progress
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
+from twin_core.discover.plots import build_plots
+from twin_core.discover.report import build_report, misfit_share
+from twin_core.discover.search import Search, search, threshold
+from twin_core.errors import TelemetryError
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+UNEXPLAINED_SHARE = 3.0
+"""Misfit over noise beyond which a record without a supported effect is called unexplained."""
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """What a closed loop leaves: the report, the corrected model, the declared one, and what the page plots."""
+
+    report: Json
+    model: CalibratedModel
+    before_model: CalibratedModel
+    plots: Json
+
+
+def close_loop(
+    spec: TwinSpec,
+    records: Sequence[Record],
+    *,
+    holdout: float | None = 0.3,
+    holdout_records: Sequence[Record] | None = None,
+    burn_in_s: float | None = None,
+    false_alarm_rate: float = 0.01,
+    progress: Progress = no_progress,
+) -> ClosedLoop:
+    """Close the loop on telemetry.
+
+    Parameters
+    ----------
+    spec
+        The declared network.
+    records
+        Segments of telemetry in SI.
+    holdout
+        Share of the time span kept back at the end; unused where ``holdout_records`` are given.
+    holdout_records
+        Separate telemetry to be predicted.
+    burn_in_s
+        First seconds of each separate hold-out record that tell its initial state and are not scored.
+    false_alarm_rate
+        Tolerated rate of findings on healthy records, between 0 and 1.
+    progress
+        Called with the fraction done; may raise to cancel.
+
+    Returns
+    -------
+    ClosedLoop
+
+    Raises
+    ------
+    TelemetryError, ModelError
+        If the telemetry cannot be used or the declared balance has no solution.
+    """
+    if not 0.0 < false_alarm_rate < 1.0:
+        raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
+    begun = time.perf_counter()
+    train, held = _split(records, holdout, holdout_records, burn_in_s)
+    calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
+    before = to_model(calibration, ())
+    found = search(
+        calibration, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m)
+    )
+    after = to_model(found.trial.calibration, found.trial.effects) if found.findings else before
+    progress(0.88, "predicting the hold-out")
+    predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
+    report = build_report(found, before, after, held, predictions, verdict_of(found, false_alarm_rate))
+    progress(0.93, "drawing")
+    plots = build_plots(found, before, after, held, predictions, report)
+    report["elapsed_s"] = time.perf_counter() - begun
+    progress(1.0, "done")
+    return ClosedLoop(report, after, before, plots)
+
+
+def _split(
+    records: Sequence[Record],
+    holdout: float | None,
+    holdout_records: Sequence[Record] | None,
+    burn_in_s: float | None,
+) -> tuple[list[Record], list[HeldOut]]:
+    """Return the training records and the hold-out."""
+    if not records:
+        raise TelemetryError("no telemetry given")
+    if holdout_records:
+        return list(records), [split_burn_in(record, burn_in_s) for record in holdout_records]
+    return split_fraction(records, 0.3 if holdout is None else holdout)
+
+
+def verdict_of(found: Search, false_alarm_rate: float) -> str:
+    """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
+    if found.findings:
+        return "effect_added"
+    noise = found.base.calibration.problem.noise_K
+    left = misfit_share(found.base.calibration.whitener, noise)
+    hinted = any(c.log_bayes_factor > threshold(false_alarm_rate) for _, c in found.rejected)
+    return "unexplained" if left > UNEXPLAINED_SHARE and hinted else "no_effect_supported"

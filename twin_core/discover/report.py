@@ -1,0 +1,160 @@
+"""The decision in a form for machines and people: report.json and what its page plots."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from twin_core._typing import FloatArray, Json
+from twin_core.calibrate.residual_noise import Whitener
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.calibrate.second_order import acceptance
+from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.discover.confirm import Comparison
+from twin_core.discover.holdout import HeldOut, Prediction
+from twin_core.discover.search import Finding, Search
+from twin_core.effects.base import Effect
+from twin_core.telemetry import Record
+
+MAX_POINTS = 2000
+
+
+def where_json(effect: Effect) -> Json:
+    """Return the place of an effect with the contract's keys; a pair is a list."""
+    return {key: value if isinstance(value, str) else list(value) for key, value in effect.where.items()}
+
+
+def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
+    """Return mean and standard deviation of an effect's parameters; tables and coefficients become lists."""
+    rows: dict[str, Any] = {}
+    for quality in effect.qualities():
+        mean = float(effect.values[quality.name])
+        std = stds.get(f"{effect.label}.{quality.name}")
+        base, bracket, _ = quality.name.partition("[")
+        if bracket:
+            row = rows.setdefault(base, {"mean": [], "std": []})
+            row["mean"].append(mean)
+            row["std"].append(std)
+        else:
+            rows[base] = {"mean": mean, "std": std}
+    for name in effect.reported_settings:
+        value = effect.settings[name]
+        rows[name] = {"mean": list(value) if isinstance(value, tuple) else value, "std": None}
+    return rows
+
+
+def evidence_json(comparison: Comparison) -> Json:
+    """Return what speaks for an effect."""
+    return {
+        "log_bayes_factor": comparison.log_bayes_factor,
+        "p_value": comparison.p_value,
+        "validation_ratio": comparison.validation_ratio,
+        "blocks_better": comparison.blocks_better,
+    }
+
+
+def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[Json]:
+    """Return the findings in the order of their evidence; effects judged together stand next to each other."""
+    stds = {p["name"]: p["std"] for p in model.summary["parameters"]}
+    fitted = {effect.place: effect for effect in model.effects}
+    rows = []
+    for finding in sorted(findings, key=lambda f: -f.comparison.log_bayes_factor):
+        for effect in finding.effects:
+            own = fitted[effect.place]
+            rows.append(
+                {
+                    "effect": own.name,
+                    "where": where_json(own),
+                    "parameters": parameters_json(own, stds),
+                    "equation": own.equation,
+                    "evidence": evidence_json(finding.comparison),
+                    "judged_with": [e.label for e in finding.effects if e is not effect],
+                    "alternatives": [
+                        {
+                            "effect": other.name,
+                            "where": where_json(other),
+                            "log_bayes_factor": comparison.log_bayes_factor,
+                        }
+                        for option, comparison in finding.alternatives
+                        for other in option
+                    ],
+                }
+            )
+    return rows
+
+
+def held_out_scores(sensors: Sequence[str], predictions: Sequence[Prediction]) -> Json:
+    """Return the open-loop errors over all hold-out stretches."""
+    return score(sensors, [p.measured_K for p in predictions], [p.predicted_K for p in predictions])
+
+
+def span_json(records: Sequence[Record], counted: int) -> Json:
+    """Return start, stop and number of samples of a set of records, times in their own form."""
+    first, last = records[0], records[-1]
+    return {"start": first.present(first.time_s[0]), "stop": last.present(last.time_s[-1]), "samples": counted}
+
+
+def noise_floor_K(model: CalibratedModel) -> float:
+    """Return the rms noise of the sensors: no model can predict readings better."""
+    return float(np.sqrt(np.mean(model.noise_vector_K() ** 2)))
+
+
+def misfit_share(whitener: Whitener, noise_K: FloatArray) -> float:
+    """Return the rms over sensors of misfit over noise: how much the model leaves beyond the sensors' own noise."""
+    return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(whitener.models, noise_K, strict=True)])))
+
+
+def build_report(
+    search: Search,
+    before: CalibratedModel,
+    after: CalibratedModel,
+    held: Sequence[HeldOut],
+    predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
+    verdict: str,
+) -> Json:
+    """Return the report of a closed loop (contract section 6).
+
+    Parameters
+    ----------
+    search
+        What was tried and found.
+    before, after
+        The declared model at its best, and with the findings.
+    held
+        The hold-out.
+    predictions
+        Open-loop predictions of both models over it.
+    verdict
+        ``effect_added``, ``no_effect_supported`` or ``unexplained``.
+    """
+    sensors = before.spec.sensors
+    scores = [held_out_scores(sensors, p) for p in predictions]
+    train = [segment.record for segment in search.base.calibration.problem.segments]
+    residuals = [[p.measured_K - p.predicted_K for p in ps] for ps in predictions]
+    scored = [h.scored for h in held]
+    counted = int(sum(np.isfinite(p.measured_K).any(axis=1).sum() for p in predictions[0]))
+    return {
+        "twin": before.spec.twin,
+        "verdict": verdict,
+        "train": span_json(train, before.summary["train"]["samples"]),
+        "holdout": span_json(scored, counted),
+        "before": scores[0],
+        "findings": findings_json(search.findings, after),
+        "after": scores[1],
+        "noise_floor_K": noise_floor_K(before),
+        "residual_whiteness": {
+            "before": residual_whiteness(residuals[0]),
+            "after": residual_whiteness(residuals[1]),
+        },
+        "criteria": {
+            "before": acceptance(before.spec, scores[0]["per_sensor"]),
+            "after": acceptance(after.spec, scores[1]["per_sensor"]),
+        },
+        "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
+        "not_supported": [
+            {"effects": [e.label for e in option], "evidence": evidence_json(comparison)}
+            for option, comparison in sorted(search.rejected, key=lambda item: -item[1].log_bayes_factor)[:8]
+        ],
+        "words": after.summary["words"],
+        "notices": before.summary["notices"],
+    }

@@ -1,0 +1,226 @@
+"""Screening: how much of the residual each candidate could explain, beyond what the calibrated parameters could.
+
+The linearised response of the sensors to every candidate is propagated at once about the smoothed measured temperatures,
+whitened in the metric of sensor noise and latent heat, and projected off what the calibrated parameters can mimic.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.latent_heat import HeatFit, parameter_columns, whiten
+from twin_core.calibrate.starting import channel_levels
+from twin_core.effects.base import Effect, Survey
+from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.terms import Along
+from twin_core.simulate.kernels import GAMMA, march_sensitivities
+from twin_core.simulate.rollout import balance_along
+
+COLUMNS_AT_ONCE = 256
+UNSEEN_SHARE = 1e-4
+"""A candidate whose response is this close to what the nuisance parameters can mimic is not told by the data."""
+
+
+@dataclass(frozen=True)
+class Probe:
+    """One candidate at one setting, screened.
+
+    Attributes
+    ----------
+    effect
+        At the amplitude that explains most.
+    gain
+        Log-likelihood that it could add, in nats, at fixed noise.
+    response : (n_rows, n_amplitudes)
+        Whitened response projected off the nuisance parameters.
+    """
+
+    effect: Effect
+    gain: float
+    response: FloatArray
+
+
+@dataclass(frozen=True)
+class Screening:
+    """All probes of one calibration, best first, and the projected residual that they were held against."""
+
+    probes: tuple[Probe, ...]
+    residual: FloatArray
+    n_tried: int
+
+
+def survey_of(fit: HeatFit) -> Survey:
+    """Return what candidates see of the training record: temperatures close to the measured ones, and inputs."""
+    network, values = fit.problem.network, fit.values
+    parts: list[Along] = []
+    rates = []
+    for nominal in fit.nominals:
+        forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
+        flat = forcing.boundaries_K.reshape(-1, forcing.boundaries_K.shape[2])
+        filled = fill_boundaries(network, values, flat)
+        parts.append(forcing.along(stages.reshape(-1, stages.shape[2]), filled, 0, forcing.n_steps))
+        balance = balance_along(network, values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
+        rates.append(balance.rate_K_per_s)
+    edges = np.cumsum([0] + [part.time_s.size for part in parts])
+    records = [n.segment.record for n in fit.nominals]
+    levels = {name: channel_levels(records, name) for name, channel in network.spec.channels.items() if channel.levels}
+    return Survey(
+        network.layout,
+        _joined(parts),
+        np.concatenate(rates),
+        values[network.capacity_index],
+        levels,
+        tuple(int(e) for e in edges),
+    )
+
+
+def _joined(parts: Sequence[Along]) -> Along:
+    """Return the points of several segments one after the other; a channel must be in all of them."""
+    common = [name for name in parts[0].inputs if all(name in part.inputs for part in parts)]
+    return Along(
+        np.concatenate([p.time_s for p in parts]),
+        np.concatenate([p.temperatures_K for p in parts]),
+        np.concatenate([p.boundaries_K for p in parts]),
+        {name: np.concatenate([p.inputs[name] for p in parts]) for name in common},
+        np.concatenate([p.sun_factor for p in parts]),
+    )
+
+
+def responses(fit: HeatFit, survey: Survey, heats: Sequence[list[tuple[int, FloatArray]]]) -> list[FloatArray]:
+    """Return the sensors' linear response to unit heats.
+
+    Parameters
+    ----------
+    fit
+        The model about whose temperatures is linearised.
+    survey
+        Its points.
+    heats
+        Per column a list of (node, (n_points,) in W).
+
+    Returns
+    -------
+    list of (n_samples, n_sensors, n_columns)
+        In K per unit, per segment.
+    """
+    network, blocks = fit.problem.network, []
+    for nominal, window in zip(fit.nominals, survey.segments(), strict=True):
+        forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
+        balance = balance_along(network, fit.values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
+        n = stages.shape[2]
+        jacobian = balance.jacobian_per_s.reshape(-1, 2, n, n)
+        parts = []
+        for first in range(0, len(heats), COLUMNS_AT_ONCE):
+            some = heats[first : first + COLUMNS_AT_ONCE]
+            rows = [
+                (column, node, series[window] / balance.capacity_J_per_K[:, node])
+                for column, heat in enumerate(some)
+                for node, series in heat
+            ]
+            block, _ = march_sensitivities(
+                forcing.step_s,
+                jacobian,
+                np.array([r[0] for r in rows], dtype=np.int64),
+                np.array([r[1] for r in rows], dtype=np.int64),
+                np.array([r[2] for r in rows]).reshape(len(rows), -1, 2),
+                np.zeros((n, len(some))),
+                forcing.sample_step,
+                network.sensor_node,
+                GAMMA,
+            )
+            parts.append(block)
+        blocks.append(np.concatenate(parts, axis=2))
+    return blocks
+
+
+def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
+    """Return columns of all segments, whitened and flattened to (n_rows, n_columns)."""
+    parts = [
+        whiten(fit.problem, fit.latent, nominal, block)[0].reshape(-1, block.shape[2])
+        for nominal, block in zip(fit.nominals, blocks, strict=True)
+    ]
+    return np.concatenate(parts)
+
+
+def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
+    """Return an orthonormal basis of what the parameters can mimic, and the residual projected off it.
+
+    Returns
+    -------
+    (n_rows + n_free, n_basis), (n_rows + n_free,)
+        Whitened; the last n_free rows are the priors.
+    """
+    parameters = fit.problem.network.parameters
+    std = parameters.prior_std
+    columns = _whitened(fit, [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals])
+    design = np.vstack([columns, np.diag(1.0 / std)])
+    data = _whitened(fit, [n.residual_K[:, :, None] for n in fit.nominals])[:, 0]
+    rows = np.concatenate([data, (parameters.free - fit.free) / std])
+    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    left, singular, _ = np.linalg.svd(design / scale, full_matrices=False)
+    basis = left[:, singular > 1e-10 * singular[0]] if singular.size else left
+    return basis, rows - basis @ (basis.T @ rows)
+
+
+def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screening:
+    """Screen candidate effects against the innovations of a fit.
+
+    Parameters
+    ----------
+    fit
+        The model so far, fitted in the presence of latent heat.
+    survey
+        Its points.
+    candidates
+        Effects at their null amplitude.
+
+    Returns
+    -------
+    Screening
+        Physically possible probes, best first.
+    """
+    effects = list(candidates)
+    heats, owners = [], []
+    for i, effect in enumerate(effects):
+        for column in effect.unit_heats(survey):
+            heats.append(column)
+            owners.append(i)
+    basis, residual = nuisance_basis(fit)
+    if not heats:
+        return Screening((), residual, 0)
+    whitened = _whitened(fit, responses(fit, survey, heats))
+    whitened = np.vstack([whitened, np.zeros((residual.size - whitened.shape[0], whitened.shape[1]))])
+    projected = whitened - basis @ (basis.T @ whitened)
+    owner, probes = np.array(owners), []
+    for i, effect in enumerate(effects):
+        columns = np.flatnonzero(owner == i)
+        probe = _probe(effect, whitened[:, columns], projected[:, columns], residual)
+        if probe is not None:
+            probes.append(probe)
+    probes.sort(key=lambda p: -p.gain)
+    return Screening(tuple(probes), residual, len(effects))
+
+
+def _probe(effect: Effect, whitened: FloatArray, projected: FloatArray, residual: FloatArray) -> Probe | None:
+    """Return the probe of one candidate; None if the data cannot tell it or its best amplitude is not physical."""
+    size = np.linalg.norm(whitened, axis=0)
+    if not (size > 0).any():
+        return None
+    left, singular, right = np.linalg.svd(projected / np.maximum(size, 1e-300), full_matrices=False)
+    seen = singular > np.sqrt(UNSEEN_SHARE)
+    if not seen.any():
+        return None
+    along = left[:, seen].T @ residual
+    amounts = right[seen].T @ (along / singular[seen]) / np.maximum(size, 1e-300)
+    moved = effect.with_amplitudes(amounts)
+    return None if moved is None else Probe(moved, 0.5 * float(along @ along), projected)
+
+
+def joint_gain(first: Probe, second: Probe, residual: FloatArray) -> float:
+    """Return the log-likelihood that two probes could add together, in nats."""
+    both = np.hstack([first.response, second.response])
+    left, singular, _ = np.linalg.svd(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300), full_matrices=False)
+    along = left[:, singular > np.sqrt(UNSEEN_SHARE)].T @ residual
+    return 0.5 * float(along @ along)

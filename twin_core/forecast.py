@@ -1,0 +1,175 @@
+"""The forecast: a rollout from the assimilated state with planned inputs, mean and honest bands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from twin_core._typing import FloatArray
+from twin_core.assimilate import assimilate
+from twin_core.calibrate.result import CalibratedModel
+from twin_core.errors import ModelError
+from twin_core.network.model import Network
+from twin_core.network.spec import TwinSpec
+from twin_core.simulate.forcing import Forcing, build_forcing
+from twin_core.simulate.rollout import Rollout, rollout, sensitivities
+from twin_core.telemetry import Record
+
+MAX_POINTS = 200_000
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Future readings.
+
+    Attributes
+    ----------
+    time_s : (n_times,)
+        On the record's own axis.
+    sensors
+        Names, (n_sensors,).
+    mean_K : (n_times, n_sensors)
+    quantiles_K
+        Probability -> (n_times, n_sensors): of what the sensors will read, their noise included.
+    """
+
+    time_s: FloatArray
+    sensors: tuple[str, ...]
+    mean_K: FloatArray
+    quantiles_K: dict[float, FloatArray]
+
+
+def forecast(
+    model: CalibratedModel,
+    record: Record,
+    horizon_s: float,
+    *,
+    step_s: float | None = None,
+    plan: Record | None = None,
+    quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+) -> Forecast:
+    """Forecast the readings after the end of a record.
+
+    Parameters
+    ----------
+    model
+        A calibrated model.
+    record
+        Telemetry up to now; its end is where the forecast starts.
+    horizon_s
+        Seconds ahead, positive.
+    step_s
+        Spacing of the forecast; the record's median sampling interval by default.
+    plan
+        Future inputs on the record's own time axis; inputs without a plan hold their last value.
+    quantiles
+        Probabilities between 0 and 1.
+
+    Returns
+    -------
+    Forecast
+        The variance adds the state's, the parameters', the misfit that the calibration saw (growing with lead time
+        up to its stationary size) and the sensor's noise.
+
+    Raises
+    ------
+    ModelError
+        If horizon, step or a quantile is out of range, or the balance has no solution.
+    """
+    step = float(np.median(np.diff(record.time_s))) if step_s is None else step_s
+    _check(horizon_s, step, quantiles)
+    network = model.network()
+    values = network.parameters.values
+    present = assimilate(model, record)
+    future = future_record(model.spec, record, horizon_s, step, plan)
+    forcing = build_forcing(network, future, model.max_step_s)
+    path = rollout(network, values, present.mean_K, forcing)
+    if not path.converged:
+        raise ModelError("the heat balance has no solution over the horizon: check the planned inputs")
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node].copy()
+    for term in network.readings:
+        part = term.evaluate(future.time_s, values[network.term_index(term)])
+        read[:, part.sensor] += part.offset_K
+    std = np.sqrt(_variance(model, network, forcing, path, present.covariance_K2, future.time_s))[1:]
+    mean = read[1:]
+    bands = {q: mean + norm.ppf(q) * std for q in quantiles}
+    return Forecast(future.time_s[1:], model.spec.sensors, mean, bands)
+
+
+def _check(horizon_s: float, step_s: float, quantiles: Sequence[float]) -> None:
+    if not (np.isfinite(horizon_s) and horizon_s > 0):
+        raise ModelError(f"horizon_s: must be a positive number of seconds (got {horizon_s})")
+    if not (np.isfinite(step_s) and 0 < step_s <= horizon_s):
+        raise ModelError(f"step_s: must be positive and at most the horizon (got {step_s})")
+    if horizon_s / step_s > MAX_POINTS:
+        raise ModelError(f"step_s: {horizon_s / step_s:.0f} points asked for, {MAX_POINTS} at most; take a longer step")
+    wrong = [q for q in quantiles if not 0.0 < q < 1.0]
+    if wrong:
+        raise ModelError(f"quantiles: must lie between 0 and 1, exclusive (got {wrong[0]})")
+
+
+def future_record(
+    spec: TwinSpec, record: Record, horizon_s: float, step_s: float, plan: Record | None
+) -> Record:
+    """Return inputs and boundary temperatures over the horizon: as planned, else the last value held.
+
+    The first sample is the present. Planned samples that lie between the forecast's own times become times too.
+    """
+    now = float(record.time_s[-1])
+    count = int(np.floor(horizon_s / step_s + 1e-9))
+    times = now + step_s * np.arange(count + 1)
+    values: dict[str, FloatArray] = {}
+    needed = [c for c in spec.used_channels if c not in spec.sensors or _is_boundary(spec, c)]
+    for name in needed:
+        column = record.values.get(name)
+        finite = None if column is None else column[np.isfinite(column)]
+        last = float(finite[-1]) if finite is not None and finite.size else np.nan
+        values[name] = np.full(times.size, last)
+        if plan is not None and name in plan.values:
+            values[name] = _planned(plan, name, times, last, spec.channels[name].is_held)
+    return Record(times, values, record.epoch_ns, "forecast")
+
+
+def _is_boundary(spec: TwinSpec, channel: str) -> bool:
+    return any(boundary.channel == channel for boundary in spec.boundaries.values())
+
+
+def _planned(plan: Record, name: str, times: FloatArray, last: float, is_held: bool) -> FloatArray:
+    """Return a planned channel at the forecast's times; before the plan begins the last measured value holds."""
+    valid = np.isfinite(plan.values[name])
+    at, column = plan.time_s[valid], plan.values[name][valid]
+    if not at.size:
+        return np.full(times.size, last)
+    if is_held:
+        position = np.searchsorted(at, times + 1e-9, side="right") - 1
+        return np.where(position >= 0, column[np.maximum(position, 0)], last)
+    inside = np.interp(times, at, column)
+    return np.where(times >= at[0], inside, last if np.isfinite(last) else column[0])
+
+
+def _variance(
+    model: CalibratedModel,
+    network: Network,
+    forcing: Forcing,
+    path: Rollout,
+    state_covariance: FloatArray,
+    time_s: FloatArray,
+) -> FloatArray:
+    """Return the variance of the readings, (n_times, n_sensors), in K^2."""
+    n_free, n_nodes = len(model.free_names), len(network.nodes)
+    starts = np.hstack([np.zeros((n_nodes, n_free)), np.eye(n_nodes)])
+    covariance = np.zeros((n_free + n_nodes, n_free + n_nodes))
+    covariance[:n_free, :n_free] = model.covariance
+    covariance[n_free:, n_free:] = state_covariance
+    blocks = [
+        np.einsum("kap,pq,kaq->ka", block, covariance, block, optimize=True)
+        for _, block in sensitivities(
+            network, network.parameters.values, forcing, path, starts, n_free, network.sensor_node
+        )
+    ]
+    lead = (time_s - time_s[0])[:, None]
+    misfit = np.array([model.misfit_K[s] for s in model.spec.sensors])
+    length = np.array([model.misfit_length_s[s] for s in model.spec.sensors])
+    grown = misfit**2 * (1.0 - np.exp(-2.0 * lead / np.maximum(length, 1e-9)))
+    return np.concatenate(blocks) + grown + model.noise_vector_K() ** 2
