@@ -17,7 +17,7 @@ SIDES: Mapping[str, tuple[int, int]] = {"left": (-1, 0), "right": (1, 0), "botto
 VOID = -1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Grid:
     """Cells of a structured grid.
 

@@ -16,6 +16,11 @@ GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 """Diagonal of the L-stable two-stage SDIRK method of order two (Alexander 1977, SIAM J. Numer. Anal. 14, eq. 1.9)."""
 
 _TOLERANCE_K = 1e-11
+"""What may be left of a stage's iteration: the energy balance of a step then closes to about 1e-10."""
+
+_ROUNDING_K = 1e-8
+"""Changes below this that no longer shrink are rounding, as in a very stiff conductor."""
+
 _MOST_ITERATIONS = 25
 
 ExtraHeat = Callable[[float, FloatArray, FloatArray, int], FloatArray]
@@ -99,7 +104,8 @@ class Sdirk2:
             size = float(np.abs(change).max())
             if np.isfinite(last):
                 self._contraction = size / max(last, _TOLERANCE_K)
-            if size * min(self._contraction, 1.0) < _TOLERANCE_K:
+            at_rounding = size < _ROUNDING_K and size > 0.5 * last
+            if size * min(self._contraction, 1.0) < _TOLERANCE_K or at_rounding:
                 heat = given + self._bent_heat(start_s, stage, temperature_K, base_K, drive)
                 heat = heat - field.conductance_matrix @ temperature_K
                 self._stage_heat = [*self._stage_heat[:stage], heat.sum(axis=0)]
