@@ -48,6 +48,14 @@ def write_text(path: Path | str, text: str) -> None:
         partial.write_text(text, encoding="utf-8")
 
 
+def make_folder(path: Path | str) -> None:
+    """Make a folder and its parents unless it exists; TwinError if that cannot be."""
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TwinError(f"{path}: the folder cannot be made ({error.strerror}); choose another") from error
+
+
 def _umask() -> int:
     """Return the process's file mode mask, which can only be read by setting it."""
     mask = os.umask(0)

@@ -1,0 +1,1 @@
+"""The command line ``twin``: one module per command, each of which imports what it needs only when it runs."""

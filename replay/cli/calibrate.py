@@ -1,0 +1,57 @@
+"""``twin calibrate``: fits the declared network to telemetry."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from replay.cli.command import FILE, Command
+
+
+@click.command(cls=Command, example="twin calibrate --spec sat.yaml --telemetry day1.csv day2.csv --out model.json")
+@click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
+@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP files, one per segment.")
+@click.option(
+    "--method",
+    default="second-order",
+    show_default=True,
+    type=click.Choice(["second-order", "neural-ode"]),
+    help="How to fit: exact sensitivities, or gradients through a neural ODE.",
+)
+@click.option("--out", required=True, type=FILE, help="Model to write, .json.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, out: Path, as_json: bool) -> None:
+    """Calibrate the declared network against telemetry, with the uncertainty of every parameter."""
+    from replay.cli.console import notify, print_line, progress_bar, to_json
+    from replay.cli.recordings import check_suffix, load_records
+    from twin_core.calibrate import calibrate as fit
+    from twin_core.files import write_text
+    from twin_core.network.spec import load_spec
+
+    check_suffix(out, (".json",))
+    spec = load_spec(spec_file)
+    records = load_records(telemetry, spec)
+    notify([notice for record in records for notice in record.notices])
+    with progress_bar("calibrating") as progress:
+        model = fit(spec, records, method=method, progress=progress)
+    write_text(out, to_json(model.to_json()))
+    if as_json:
+        print_line(to_json({"out": str(out)} | model.summary).rstrip())
+    else:
+        _print_summary(model.summary, out)
+
+
+def _print_summary(summary: dict[str, Any], out: Path) -> None:
+    """Print the parameters with their uncertainty, the misfit of each sensor, and what the data cannot tell."""
+    from replay.cli.console import notify, print_line, print_table, short
+
+    parameters = [
+        [p["name"], short(p["mean"], 4), short(p["std"], 2), p.get("unit") or ""] for p in summary["parameters"]
+    ]
+    print_table("calibrated parameters", ["parameter", "mean", "std", "unit"], parameters)
+    sensors = [[name, short(row["rmse_K"]), short(row["bias_K"], 2)] for name, row in summary["per_sensor"].items()]
+    print_table("training misfit", ["sensor", "rmse K", "bias K"], sensors)
+    for words in summary.get("words", ()):
+        print_line(words)
+    notify(summary.get("notices", ()))
+    print_line(f"wrote {out}")

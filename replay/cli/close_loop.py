@@ -1,0 +1,127 @@
+"""``twin close-loop``: from telemetry to a verdict, without a service."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from replay.cli.command import FILE, Command
+
+if TYPE_CHECKING:
+    from twin_core.discover import ClosedLoop
+
+VERDICTS = {
+    "effect_added": "an undeclared effect was found and added",
+    "no_effect_supported": "the declared model suffices: no effect is supported by the data",
+    "unexplained": "something is missing that no known effect explains",
+}
+
+
+@click.command(
+    "close-loop", cls=Command, example="twin close-loop --spec sat.yaml --telemetry flight.csv --holdout 0.3 --out loop"
+)
+@click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
+@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP files, one per segment.")
+@click.option("--holdout", type=float, help="Share of the time span kept back at the end.  [default: 0.3]")
+@click.option("--holdout-telemetry", multiple=True, type=FILE, help="Separate files kept back instead.")
+@click.option("--burn-in", type=float, help="First seconds of each hold-out file that tell its initial state.")
+@click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
+@click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
+@click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
+def close_loop(
+    spec_file: Path,
+    telemetry: tuple[Path, ...],
+    holdout: float | None,
+    holdout_telemetry: tuple[Path, ...],
+    burn_in: float | None,
+    false_alarm_rate: float,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Calibrate, find what the model lacks, add it, and measure the error on telemetry kept back.
+
+    Exits with 0 whenever it reaches a verdict, also when the verdict is that no effect is supported.
+    """
+    from replay.cli.console import notify, print_line, progress_bar, to_json
+    from replay.cli.recordings import check_apart, load_records
+    from twin_core.discover import close_loop as run
+    from twin_core.network.spec import load_spec
+
+    _check(holdout, holdout_telemetry, burn_in, out)
+    spec = load_spec(spec_file)
+    records = load_records(telemetry, spec)
+    held_out = load_records(holdout_telemetry, spec)
+    check_apart(records, held_out)
+    notices = [notice for record in (*records, *held_out) for notice in record.notices]
+    notify(notices)
+    with progress_bar("closing the loop") as progress:
+        loop = run(
+            spec,
+            records,
+            holdout=None if held_out else (0.3 if holdout is None else holdout),
+            holdout_records=held_out or None,
+            burn_in_s=burn_in,
+            false_alarm_rate=false_alarm_rate,
+            progress=progress,
+        )
+    _save(loop, out)
+    if as_json:
+        print_line(to_json(loop.report).rstrip())
+    else:
+        print_report(loop.report)
+        print_line(f"wrote {out}/report.html, report.json, model.json")
+
+
+def _check(holdout: float | None, holdout_telemetry: tuple[Path, ...], burn_in: float | None, out: Path) -> None:
+    """Refuse options that contradict each other, before anything is read."""
+    if holdout is not None and holdout_telemetry:
+        raise click.UsageError("--holdout and --holdout-telemetry exclude each other; give one of them")
+    if holdout is not None and not 0.0 < holdout < 1.0:
+        raise click.UsageError(f"--holdout must be between 0 and 1, exclusive (got {holdout:g})")
+    if burn_in is not None and not holdout_telemetry:
+        raise click.UsageError("--burn-in belongs to --holdout-telemetry")
+    if burn_in is not None and not 0.0 <= burn_in < float("inf"):
+        raise click.UsageError(f"--burn-in must be a number of seconds (got {burn_in:g})")
+    if out.exists() and not out.is_dir():
+        raise click.UsageError(f"--out {out} is a file; name a folder")
+
+
+def _save(loop: "ClosedLoop", out: Path) -> None:
+    from twin_core.discover.html import render
+
+    from replay.cli.console import to_json
+    from twin_core.files import make_folder, write_text
+
+    make_folder(out)
+    write_text(out / "model.json", to_json(loop.model.to_json()))
+    write_text(out / "report.json", to_json(loop.report))
+    write_text(out / "report.html", render(loop.report, loop.plots))
+
+
+def print_report(report: dict[str, Any]) -> None:
+    """Print the verdict, the findings and the held-out error before and after."""
+    from replay.cli.console import print_line, print_table, short
+
+    print_line(f"{report['twin']}: {VERDICTS[report['verdict']]}")
+    for finding in report["findings"]:
+        print_line(f"  {describe(finding)}; log Bayes factor {short(finding['evidence']['log_bayes_factor'])}")
+        for other in finding["alternatives"]:
+            print_line(f"    cannot be told from {describe(other)}")
+    before, after = report["before"], report["after"]
+    rows = [["all sensors", short(before["rmse_K"]), short(after["rmse_K"])]]
+    for sensor, scores in before["per_sensor"].items():
+        rows.append([sensor, short(scores["rmse_K"]), short(after["per_sensor"][sensor]["rmse_K"])])
+    print_table("held-out rmse", ["sensor", "before K", "after K"], rows)
+
+
+def describe(finding: dict[str, Any]) -> str:
+    """Return an effect, its place and its parameters in one phrase."""
+    from replay.cli.console import short
+
+    places = [" - ".join(place) if isinstance(place, list) else place for place in finding["where"].values()]
+    values = [
+        f"{name} = {short(p['mean'], 4)} ± {short(p['std'], 2)}"
+        for name, p in finding.get("parameters", {}).items()
+        if isinstance(p["mean"], int | float)
+    ]
+    return f"{finding['effect']} at {', '.join(places)}" + (f" ({'; '.join(values)})" if values else "")

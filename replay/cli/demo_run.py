@@ -1,0 +1,193 @@
+"""The steps of the demonstration. Only the first knows what is hidden; the service learns it from telemetry or not."""
+
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from replay.cli.console import print_line, print_table, progress_bar, short, to_json
+from replay.cli.recordings import save_record
+from replay.cli.service_process import running_service
+from replay.errors import ReplayError
+from replay.player import play
+from replay.source import load
+from service.client import ApiError, TwinClient, Unreachable
+from service.schemas import Job
+from twin_core.errors import TwinError
+from twin_core.fem.demo import demo_scenario
+from twin_core.fem.hidden.base import WHERE_KEYS
+from twin_core.fem.scenario import Scenario
+from twin_core.fem.simulate import simulate
+from twin_core.files import make_folder, write_text
+from twin_core.network.spec import TwinSpec, dump_spec
+
+RECORDING = "orbits.mcap"
+HOLDOUT = 0.3
+
+Place = tuple[str, frozenset[tuple[str, frozenset[str]]]]
+"""An effect's name and where it acts, for comparison: pairs have no order."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a demonstration came to.
+
+    Attributes
+    ----------
+    hidden
+        Effect and place that the simulator hid; None where nothing was hidden.
+    found
+        "named" as a finding, "alternative" of a finding, "nothing" as there was nothing to find, or "no".
+    report
+        The report of the diagnosis.
+    misfit
+        Rms innovation and mean NIS of the calibrated declared model, which show that something is missing.
+    elapsed_s
+        Wall clock.
+    url
+        Where the service listens.
+    """
+
+    hidden: dict[str, Any] | None
+    found: str
+    report: dict[str, Any]
+    misfit: dict[str, Any]
+    elapsed_s: float
+    url: str
+
+    @property
+    def success(self) -> bool:
+        """Whether the hidden effect was found and the held-out error fell (or nothing hidden, nothing found)."""
+        if self.hidden is None:
+            return self.found == "nothing"
+        return self.found != "no" and self.report["after"]["rmse_K"] < self.report["before"]["rmse_K"]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the outcome for machines, the whole report included."""
+        return {
+            "hidden": self.hidden,
+            "found": self.found,
+            "success": self.success,
+            "before_rmse_K": self.report["before"]["rmse_K"],
+            "after_rmse_K": self.report["after"]["rmse_K"],
+            "misfit": self.misfit,
+            "elapsed_s": self.elapsed_s,
+            "url": self.url,
+            "report": self.report,
+        }
+
+
+@contextmanager
+def run_demo(effect: str, seed: int, out: Path) -> Iterator[Outcome]:
+    """Run the demonstration and yield its outcome while the service still runs.
+
+    Raises
+    ------
+    TwinError, ReplayError
+        If the effect is unknown, a file cannot be written or a step of the service fails.
+    """
+    begun = time.perf_counter()
+    scenario, spec = demo_scenario(effect, seed)
+    make_folder(out)
+    _record(scenario, out / RECORDING)
+    with tempfile.TemporaryDirectory(prefix="twin-demo-") as folder, running_service(Path(folder)) as url:
+        try:
+            with TwinClient(url) as client:
+                yield _operate(client, url, spec, hidden_effect(scenario), out, begun)
+        except (ApiError, Unreachable) as error:
+            raise ReplayError(str(error)) from error
+
+
+def _record(scenario: Scenario, path: Path) -> None:
+    """Simulate the orbits and write what the sensors read."""
+    with progress_bar("simulating orbits") as progress:
+        record = simulate(scenario, progress).record
+    units = {name: channel.unit for name, channel in scenario.channels.items()}
+    save_record(path, record, units, {"scenario": scenario.scenario})
+
+
+def _operate(
+    client: TwinClient, url: str, spec: TwinSpec, hidden: dict[str, Any] | None, out: Path, begun: float
+) -> Outcome:
+    """Do what an operator does: register, stream, calibrate, look at residuals, diagnose, keep the report."""
+    client.register(dump_spec(spec))
+    _replay(client, spec.twin, out / RECORDING)
+    _finish(client, spec.twin, client.calibrate(spec.twin, activate=True), "calibrating")
+    misfit = _misfit(client, spec.twin)
+    job = _finish(client, spec.twin, client.diagnose(spec.twin, holdout=HOLDOUT, activate=True), "tracing the misfit")
+    report = dict(job.result or {})
+    write_text(out / "report.json", to_json(report))
+    write_text(out / "report.html", client.report_html(spec.twin, job))
+    return Outcome(hidden, verdict_on(report, hidden), report, misfit, time.perf_counter() - begun, url)
+
+
+def _replay(client: TwinClient, twin: str, path: Path) -> None:
+    (recording,) = load([path])
+    with progress_bar("replaying over HTTP") as progress:
+        tally = play(recording, client, twin, progress=lambda t: progress(t.sent / t.total, f"{t.sent} samples"))
+    if tally.accepted != tally.total:
+        raise TwinError(f"the service took {tally.accepted} of {tally.total} samples")
+
+
+def _finish(client: TwinClient, twin: str, job: Job, title: str) -> Job:
+    """Return a job once it succeeded; TwinError with its message if it did not."""
+    with progress_bar(title) as progress:
+        job = client.wait(twin, job, on_progress=lambda j: progress(j.progress, j.message))
+    if job.state != "succeeded":
+        raise TwinError(f"{job.kind} {job.state}: {job.message}")
+    return job
+
+
+def _misfit(client: TwinClient, twin: str) -> dict[str, Any]:
+    """Return how badly one-step predictions of the declared model fit: rms innovation, mean NIS, sensors."""
+    residuals = client.residuals(twin)
+    innovations = {name: np.array(column, dtype=np.float64) for name, column in residuals.residual_K.items()}
+    nis = np.array(residuals.nis, dtype=np.float64)
+    rms = {name: float(np.sqrt(np.nanmean(column**2))) for name, column in innovations.items()}
+    return {"nis_mean": float(np.nanmean(nis)), "n_sensors": len(rms), "innovation_rms_K": rms}
+
+
+def hidden_effect(scenario: Scenario) -> dict[str, Any] | None:
+    """Return effect, place and parameters of what a scenario hides, None if it hides nothing."""
+    if not scenario.hidden:
+        return None
+    data = scenario.hidden[0].model_dump(mode="json", exclude_none=True)
+    where = {key: data[key] for key in WHERE_KEYS if key in data}
+    parameters = {key: value for key, value in data.items() if key not in where and key != "effect"}
+    return {"effect": data["effect"], "where": where, "parameters": parameters}
+
+
+def place_of(effect: Mapping[str, Any]) -> Place:
+    """Return an effect's name and place in a form that compares equal whatever the order of a pair."""
+    where = effect["where"].items()
+    return effect["effect"], frozenset((key, frozenset([v] if isinstance(v, str) else v)) for key, v in where)
+
+
+def verdict_on(report: Mapping[str, Any], hidden: Mapping[str, Any] | None) -> str:
+    """Return whether the report names what was hidden: "named", "alternative", "nothing" or "no"."""
+    findings = report["findings"]
+    if hidden is None:
+        return "no" if findings else "nothing"
+    if any(place_of(finding) == place_of(hidden) for finding in findings):
+        return "named"
+    others = [other for finding in findings for other in finding["alternatives"]]
+    return "alternative" if any(place_of(other) == place_of(hidden) for other in others) else "no"
+
+
+def print_outcome(outcome: Outcome, out: Path) -> None:
+    """Print what was hidden, what was found, and the error before and after."""
+    from replay.cli.close_loop import describe, print_report
+
+    misfit = outcome.misfit
+    rows = [[name, short(value)] for name, value in misfit["innovation_rms_K"].items()]
+    print_table("one-step residual of the declared model", ["sensor", "rms K"], rows)
+    print_line(f"NIS {short(misfit['nis_mean'])}; {misfit['n_sensors']} would be consistent")
+    print_report(outcome.report)
+    hidden = "nothing" if outcome.hidden is None else describe(outcome.hidden | {"parameters": {}})
+    print_line(f"hidden by the simulator: {hidden}; found: {outcome.found}")
+    print_line(f"wrote {out}/report.html, report.json, {RECORDING} in {outcome.elapsed_s:.0f} s")

@@ -1,0 +1,103 @@
+"""``twin forecast``: what the sensors will read, with quantiles."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from replay.cli.command import FILE, Command
+
+if TYPE_CHECKING:
+    from twin_core.calibrate import CalibratedModel
+    from twin_core.forecast import Forecast
+    from twin_core.telemetry import Record
+
+_OUT = (".csv", ".json")
+
+
+@click.command(
+    cls=Command, example="twin forecast --model model.json --telemetry today.csv --horizon 86400 --out tomorrow.csv"
+)
+@click.option("--model", "model_file", required=True, type=FILE, help="Model of twin calibrate or twin close-loop.")
+@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP file up to now.")
+@click.option("--horizon", required=True, type=float, help="Seconds to look ahead.")
+@click.option("--step", type=float, help="Seconds between forecasts.  [default: as the telemetry is sampled]")
+@click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP; inputs without a plan hold their last value.")
+@click.option("--out", required=True, type=FILE, help="Forecast to write, .csv or .json.")
+@click.option("--json", "as_json", is_flag=True, help="Print the forecast as JSON.")
+def forecast(
+    model_file: Path,
+    telemetry: tuple[Path, ...],
+    horizon: float,
+    step: float | None,
+    plan: Path | None,
+    out: Path,
+    as_json: bool,
+) -> None:
+    """Forecast temperatures from the end of a record, with mean and quantiles in each channel's unit."""
+    from replay.cli.console import notify, print_line, to_json
+    from replay.cli.models import load_model
+    from replay.cli.recordings import check_suffix, load_record
+    from twin_core.errors import TelemetryError
+    from twin_core.forecast import forecast as look_ahead
+
+    check_suffix(out, _OUT)
+    if len(telemetry) > 1:
+        raise TelemetryError(f"{telemetry[1]}: a forecast starts at the end of one file; name one")
+    model = load_model(model_file)
+    record = load_record(telemetry[0], model.spec)
+    planned = _load_plan(plan, record, model) if plan else None
+    notify([*record.notices, *(planned.notices if planned else ())])
+    result = look_ahead(model, record, horizon, step_s=step, plan=planned)
+    document = _document(result, record, model)
+    _write(out, document)
+    if as_json:
+        print_line(to_json(document).rstrip())
+    else:
+        print_line(f"{out}: {len(result.time_s)} instants of {len(result.sensors)} sensors")
+
+
+def _load_plan(path: Path, record: "Record", model: "CalibratedModel") -> "Record":
+    """Return the planned inputs on the time axis of the record."""
+    from dataclasses import replace
+
+    from replay.cli.recordings import load_record
+    from twin_core.errors import TelemetryError
+
+    plan = load_record(path, model.spec, required=())
+    if plan.notices:
+        raise TelemetryError(f"{plan.notices[0].replace('ignored columns', 'has columns')}; correct or remove them")
+    inputs = [name for name in plan.values if name not in model.spec.sensors]
+    if not inputs:
+        raise TelemetryError(f"{path}: plans no input; give columns of power, auxiliary or boundary channels")
+    if (plan.epoch_ns is None) != (record.epoch_ns is None):
+        raise TelemetryError(f"{path}: must write time in the form of {record.name} (dates or seconds)")
+    shift_s = 0.0 if plan.epoch_ns is None or record.epoch_ns is None else (plan.epoch_ns - record.epoch_ns) / 1e9
+    return replace(plan, time_s=plan.time_s + shift_s, epoch_ns=record.epoch_ns)
+
+
+def _document(result: "Forecast", record: "Record", model: "CalibratedModel") -> dict[str, Any]:
+    """Return the forecast in the form that the service answers with, times in the telemetry's own form."""
+    from twin_core.units import from_si
+
+    units = {sensor: model.spec.channels[sensor].unit for sensor in result.sensors}
+    values = {}
+    for i, (sensor, unit) in enumerate(units.items()):
+        bands = {f"q{100 * q:02.0f}": from_si(table[:, i], unit).tolist() for q, table in result.quantiles_K.items()}
+        values[sensor] = {"mean": from_si(result.mean_K[:, i], unit).tolist()} | bands
+    time = [record.present(t) for t in result.time_s.tolist()]
+    return {"issued": record.present(float(record.time_s[-1])), "time": time, "values": values, "units": units}
+
+
+def _write(out: Path, document: dict[str, Any]) -> None:
+    from replay.cli.console import to_json
+    from twin_core.files import write_text
+
+    if out.suffix == ".json":
+        write_text(out, to_json(document))
+        return
+    name = "time" if isinstance(document["time"][0], str) else "time_s"
+    columns = {f"{sensor}_{kind}": c for sensor, kinds in document["values"].items() for kind, c in kinds.items()}
+    rows = zip(document["time"], *(map("{:.6f}".format, column) for column in columns.values()), strict=True)
+    lines = [",".join([name, *columns]), *(",".join(map(str, row)) for row in rows)]
+    write_text(out, "\n".join(lines) + "\n")

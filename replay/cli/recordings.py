@@ -1,0 +1,161 @@
+"""Telemetry files of either format -> records in SI, and back."""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from replay.errors import ReplayError
+from replay.mapping import apply_mapping, map_topics
+from replay.mcap_io import read_mcap, write_mcap
+from replay.recording import Recording
+from twin_core.errors import TelemetryError
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+from twin_core.telemetry_csv import ignored_notice, implausible, present_channels, read_csv, write_columns
+from twin_core.units import format_instant, from_si, to_si
+
+DATED = "dated"
+"""Metadata of an MCAP file: "false" where log times are seconds since an unknown start."""
+SUFFIXES = (".csv", ".mcap")
+_TEMPERATURE_UNITS = ("K", "degC")
+
+
+def load_record(path: Path, spec: TwinSpec, *, required: Collection[str] | None = None) -> Record:
+    """Read one telemetry file, CSV or MCAP.
+
+    Parameters
+    ----------
+    path
+        A file ending in .csv or .mcap.
+    spec
+        Declares channels and units; the topics of an MCAP file are matched by name or by their last part.
+    required
+        Channels that the file must have; by default every channel that the twin uses.
+
+    Raises
+    ------
+    TelemetryError, RecordingError
+        With one line naming the file and what is wrong.
+    """
+    check_suffix(path)
+    if path.suffix == ".csv":
+        return read_csv(path, spec, required=required)
+    return _from_recording(path, read_mcap(path), spec, required)
+
+
+def load_records(paths: Sequence[Path], spec: TwinSpec) -> list[Record]:
+    """Read several files as segments of one record, in the order given.
+
+    Raises
+    ------
+    TelemetryError
+        If a file is wrong, named twice, or only some of them (or of the excluded intervals) are dated.
+    """
+    for position, path in enumerate(paths):
+        if path.resolve() in [earlier.resolve() for earlier in paths[:position]]:
+            raise TelemetryError(f"{path}: is named twice; each segment counts once")
+    records = [load_record(path, spec) for path in paths]
+    for record in records:
+        if (record.epoch_ns is None) != (records[0].epoch_ns is None):
+            raise TelemetryError(f"{record.name}: {_form(record)}, {records[0].name} {_form(records[0])}; use one form")
+        check_exclude(spec, record)
+    return records
+
+
+def check_exclude(spec: TwinSpec, record: Record) -> None:
+    """Refuse excluded intervals that are written in another form of time than the telemetry."""
+    for position, interval in enumerate(spec.exclude):
+        if isinstance(interval.start, str) != (record.epoch_ns is not None):
+            form = "a date" if isinstance(interval.start, str) else "a number of seconds"
+            raise TelemetryError(
+                f"exclude[{position}].start: is {form}, but {record.name} {_form(record)}; write the same form"
+            )
+
+
+def check_apart(records: Sequence[Record], held_out: Sequence[Record]) -> None:
+    """Refuse a hold-out that shares a file or, where dated, a time with the training telemetry."""
+    for held in held_out:
+        for record in records:
+            if Path(held.name).resolve() == Path(record.name).resolve():
+                raise TelemetryError(f"{held.name}: is both telemetry and hold-out; a hold-out must be kept apart")
+            if (held.epoch_ns is None) != (record.epoch_ns is None):
+                raise TelemetryError(f"{held.name}: {_form(held)}, {record.name} {_form(record)}; use one form")
+            if held.epoch_ns is not None and _overlap(held, record):
+                raise TelemetryError(f"{held.name}: overlaps {record.name} in time; a hold-out must be kept apart")
+
+
+def _overlap(one: Record, other: Record) -> bool:
+    (start, stop), (other_start, other_stop) = _span_ns(one), _span_ns(other)
+    return start <= other_stop and other_start <= stop
+
+
+def _span_ns(record: Record) -> tuple[int, int]:
+    epoch_ns = record.epoch_ns or 0
+    return epoch_ns + round(record.time_s[0] * 1e9), epoch_ns + round(record.time_s[-1] * 1e9)
+
+
+def _form(record: Record) -> str:
+    return "counts seconds" if record.epoch_ns is None else "is dated"
+
+
+def save_record(path: Path, record: Record, units: Mapping[str, str | None], metadata: Mapping[str, str]) -> None:
+    """Write a record in the units given, as CSV or MCAP; the file appears whole or not at all."""
+    check_suffix(path)
+    if path.suffix == ".csv":
+        write_columns(path, record, dict(units))
+        return
+    if not path.parent.is_dir():
+        raise TelemetryError(f"{path}: cannot be written (no such folder); choose a folder that exists")
+    time_ns = (record.epoch_ns or 0) + np.rint(record.time_s * 1e9).astype(np.int64)
+    columns = {name: from_si(values, units[name]) for name, values in record.values.items()}
+    stated = {name: unit for name, unit in units.items() if unit is not None}
+    dated = "false" if record.epoch_ns is None else "true"
+    write_mcap(path, time_ns, columns, stated, {**metadata, DATED: dated})
+
+
+def check_suffix(path: Path, suffixes: Sequence[str] = SUFFIXES) -> None:
+    """Refuse a file whose name does not tell one of the formats."""
+    if path.suffix not in suffixes:
+        raise TelemetryError(f"{path}: the name must end in {' or '.join(suffixes)}")
+
+
+def convert_units(recording: Recording, spec: TwinSpec, name: str) -> Recording:
+    """Return a recording, columns named by channel, with its temperatures in the units of the specification.
+
+    Raises
+    ------
+    ReplayError
+        If the file states a unit that is no other spelling of the channel's own.
+    """
+    columns = dict(recording.columns)
+    for channel, unit in recording.units.items():
+        wanted = spec.channels[channel].unit
+        if wanted is None or unit == wanted:
+            continue
+        if unit not in _TEMPERATURE_UNITS or wanted not in _TEMPERATURE_UNITS:
+            raise ReplayError(f"{name}: channel '{channel}' is in {unit}, the specification says {wanted}; correct one")
+        columns[channel] = from_si(to_si(columns[channel], unit), wanted)
+    return Recording(recording.time_ns, columns, {}, recording.metadata)
+
+
+def _from_recording(path: Path, recording: Recording, spec: TwinSpec, required: Collection[str] | None) -> Record:
+    name = str(path)
+    topics = list(recording.columns)
+    try:
+        mapping = map_topics(topics, list(spec.channels))
+    except ReplayError as error:
+        raise TelemetryError(f"{name}: {error}") from error
+    named = convert_units(apply_mapping(recording, mapping), spec, name)
+    present_channels(name, list(named.columns), spec, required)
+    dated = recording.metadata.get(DATED) != "false"
+    epoch_ns = int(named.time_ns[0]) if dated else None
+    time_s = (named.time_ns - (epoch_ns or 0)) / 1e9
+    values = {channel: to_si(column, spec.channels[channel].unit) for channel, column in named.columns.items()}
+    for channel, column in values.items():
+        fault = implausible(spec.channels[channel], column)
+        if fault is not None:
+            at = format_instant(int(named.time_ns[fault[0]])) if dated else f"{time_s[fault[0]]:g} s"
+            raise TelemetryError(f"{name}: sample at {at}: channel '{channel}' {fault[1]}")
+    ignored = ignored_notice(name, [mapping.get(topic, topic) for topic in topics], spec)
+    return Record(time_s, values, epoch_ns, name, ignored)
