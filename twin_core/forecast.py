@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, Json
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
@@ -48,6 +48,7 @@ def forecast(
     step_s: float | None = None,
     plan: Record | None = None,
     quantiles: Sequence[float] = (0.05, 0.5, 0.95),
+    state: Json | None = None,
 ) -> Forecast:
     """Forecast the readings after the end of a record.
 
@@ -65,6 +66,8 @@ def forecast(
         Future inputs on the record's own time axis; inputs without a plan hold their last value.
     quantiles
         Probabilities between 0 and 1.
+    state
+        The ``state`` of an assimilation whose last sample is the first one of ``record``, to start the filter from.
 
     Returns
     -------
@@ -81,7 +84,7 @@ def forecast(
     _check(horizon_s, step, quantiles)
     network = model.network()
     values = network.parameters.values
-    present = assimilate(model, record)
+    present = assimilate(model, record, state)
     future = future_record(model.spec, record, horizon_s, step, plan)
     forcing = build_forcing(network, future, model.max_step_s)
     path = rollout(network, values, present.mean_K, forcing)
