@@ -1,0 +1,165 @@
+"""An executor whose every task runs in a process of its own, which can be ended at any moment.
+
+``ProcessPoolExecutor`` shares processes between tasks, and a worker that dies or is ended takes the whole pool with
+it. Here a task that crashes, hangs or is cancelled harms nobody else.
+"""
+
+import contextlib
+import importlib
+import multiprocessing
+import multiprocessing.connection
+import os
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from threading import Event, Thread
+from typing import Any, ParamSpec, TypeVar
+
+from twin_core.errors import TwinError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+END_GRACE_S = 2.0
+POLL_S = 0.2
+
+
+class JobFailed(Exception):
+    """A task ended without a result; the message says why in one line."""
+
+
+class JobCancelled(Exception):
+    """A task was cancelled while it ran."""
+
+
+class Cancel:
+    """A request to end a task, given from any thread."""
+
+    def __init__(self) -> None:
+        """Start without a request."""
+        self._event = Event()
+
+    def request(self) -> None:
+        """Ask the task to end."""
+        self._event.set()
+
+    @property
+    def requested(self) -> bool:
+        """Whether the task shall end."""
+        return self._event.is_set()
+
+
+class ProcessPerTask(Executor):
+    """Runs ``function(*args, progress=...)`` in a fresh spawned process per task, at most ``max_workers`` at a time."""
+
+    def __init__(self, max_workers: int, deadline_s: float) -> None:
+        """Tasks that run longer than ``deadline_s`` are ended."""
+        self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix="job")
+        self._deadline_s = deadline_s
+        self._closing = Cancel()
+
+    def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
+        """Queue a task without progress and without a way to end it early."""
+        return self.start(function, args, kwargs, lambda fraction, message: None, Cancel())
+
+    def start(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> "Future[T]":
+        """Queue a task; ``progress`` is called in a thread of this process."""
+        call = (f"{function.__module__}:{function.__qualname__}", args, kwargs)
+        return self._threads.submit(self._supervise, call, progress, cancel)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End every task."""
+        self._closing.request()
+        self._threads.shutdown(wait=wait, cancel_futures=True)
+
+    def _supervise(self, call: tuple[str, Any, Any], progress: Callable[[float, str], None], cancel: Cancel) -> Any:
+        ours, theirs = _CONTEXT.Pipe()
+        process = _CONTEXT.Process(target=_run, args=(theirs, *call), daemon=True)
+        process.start()
+        theirs.close()
+        deadline_s = time.monotonic() + self._deadline_s
+        try:
+            while True:
+                if cancel.requested or self._closing.requested:
+                    raise JobCancelled
+                if time.monotonic() > deadline_s:
+                    raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+                if not ours.poll(POLL_S):
+                    continue
+                kind, *rest = _receive(ours, process)
+                if kind == "progress":
+                    progress(*rest)
+                elif kind == "failed":
+                    raise JobFailed(rest[0])
+                else:
+                    return rest[0]
+        finally:
+            _end(process)
+            ours.close()
+
+
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+def _receive(ours: Connection, process: Any) -> tuple[Any, ...]:
+    try:
+        message: tuple[Any, ...] = ours.recv()
+    except (EOFError, OSError):
+        process.join(END_GRACE_S)
+        code = process.exitcode
+        how = signal.Signals(-code).name if code is not None and code < 0 else f"exit status {code}"
+        raise JobFailed(f"its worker process died ({how}); the service itself is well") from None
+    return message
+
+
+def _end(process: Any) -> None:
+    process.join(0.0 if process.is_alive() else END_GRACE_S)
+    if process.is_alive():
+        process.terminate()
+        process.join(END_GRACE_S)
+    if process.is_alive():
+        process.kill()
+        process.join()
+    process.close()
+
+
+def _end_with_parent() -> None:
+    """End this process when the service dies, however it dies: nobody would want the result."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        multiprocessing.connection.wait([parent.sentinel])
+        os._exit(1)
+
+
+def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+    """Do the task: the whole life of a worker process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the parent decides
+    os.nice(10)  # ingest and the live state go first
+    Thread(target=_end_with_parent, daemon=True).start()
+    module, _, qualified = name.partition(":")
+    function: Any = importlib.import_module(module)
+    for part in qualified.split("."):
+        function = getattr(function, part)
+
+    def progress(fraction: float, message: str) -> None:
+        connection.send(("progress", float(fraction), str(message)))
+
+    try:
+        answer = ("done", function(*args, progress=progress, **kwargs))
+    except TwinError as error:
+        answer = ("failed", str(error))
+    except MemoryError:
+        answer = ("failed", "ran out of memory; use a shorter part of the archive")
+    except Exception as error:
+        answer = ("failed", f"{type(error).__name__}: {error}")
+    with contextlib.suppress(BrokenPipeError):  # the parent is gone; nobody wants the answer
+        connection.send(answer)

@@ -1,0 +1,112 @@
+"""Model versions: immutable, with their provenance, and the log of which one was active when."""
+
+import sqlite3
+from dataclasses import dataclass
+from typing import Any
+
+import orjson
+
+from service.instants import format_instant, now_us
+from service.problems import Problem
+
+
+@dataclass(frozen=True)
+class ModelRow:
+    """One version without its document."""
+
+    version: int
+    created_us: int
+    source: str
+    summary: str
+    active: bool
+
+    def wire(self) -> dict[str, Any]:
+        """Return the version as clients see it."""
+        return {
+            "version": self.version,
+            "active": self.active,
+            "created": format_instant(self.created_us),
+            "source": self.source,
+            **orjson.loads(self.summary),
+        }
+
+
+@dataclass(frozen=True)
+class Active:
+    """The active model: its version and everything needed to run it."""
+
+    version: int
+    epoch_us: int
+    document: str
+
+
+_SELECT = """
+    SELECT version, created_us, source, summary,
+           version IS (SELECT version FROM activation WHERE activation.twin = model.twin ORDER BY id DESC LIMIT 1)
+    FROM model WHERE twin = ?
+"""
+
+
+def add(
+    connection: sqlite3.Connection, twin: int, source: str, summary: dict[str, Any], document: dict[str, Any]
+) -> int:
+    """Store a new version and return its number."""
+    row = connection.execute("SELECT coalesce(max(version), 0) + 1 FROM model WHERE twin = ?", (twin,)).fetchone()
+    connection.execute(
+        "INSERT INTO model (twin, version, created_us, source, summary, document) VALUES (?, ?, ?, ?, ?, ?)",
+        (twin, row[0], now_us(), source, orjson.dumps(summary).decode(), orjson.dumps(document).decode()),
+    )
+    return int(row[0])
+
+
+def activate(connection: sqlite3.Connection, twin: int, version: int, reason: str) -> None:
+    """Make a version the active one; Problem 404 if there is none of that number."""
+    get(connection, twin, version)
+    connection.execute(
+        "INSERT INTO activation (twin, version, at_us, reason) VALUES (?, ?, ?, ?)", (twin, version, now_us(), reason)
+    )
+
+
+def select(connection: sqlite3.Connection, twin: int) -> list[ModelRow]:
+    """Return every version, the oldest first."""
+    return [_row(row) for row in connection.execute(_SELECT + "ORDER BY version", (twin,))]
+
+
+def get(connection: sqlite3.Connection, twin: int, version: int) -> ModelRow:
+    """Return one version; Problem 404 if there is none of that number."""
+    row = connection.execute(_SELECT + "AND version = ?", (twin, version)).fetchone()
+    if row is None:
+        raise Problem(404, f"no model version {version}")
+    return _row(row)
+
+
+def _row(row: tuple[Any, ...]) -> ModelRow:
+    version, created_us, source, summary, active = row
+    return ModelRow(version, created_us, source, summary, bool(active))
+
+
+def document(connection: sqlite3.Connection, twin: int, version: int) -> dict[str, Any]:
+    """Return the model itself; Problem 404 if there is none of that number."""
+    get(connection, twin, version)
+    query = "SELECT document FROM model WHERE twin = ? AND version = ?"
+    return dict(orjson.loads(connection.execute(query, (twin, version)).fetchone()[0]))
+
+
+def activations(connection: sqlite3.Connection, twin: int) -> list[dict[str, Any]]:
+    """Return the log of activations, the newest first."""
+    query = "SELECT version, at_us, reason FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 100"
+    return [
+        {"version": version, "time": format_instant(at_us), "reason": reason}
+        for version, at_us, reason in connection.execute(query, (twin,))
+    ]
+
+
+def active(connection: sqlite3.Connection, twin: int) -> Active | None:
+    """Return the active model, or None before the first activation."""
+    row = connection.execute(
+        """SELECT model.version, model.summary, model.document FROM activation
+           JOIN model ON model.twin = activation.twin AND model.version = activation.version
+           WHERE activation.twin = ? ORDER BY activation.id DESC LIMIT 1""",
+        (twin,),
+    ).fetchone()
+    return None if row is None else Active(row[0], orjson.loads(row[1])["epoch_us"], row[2])
