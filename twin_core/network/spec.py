@@ -2,9 +2,10 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -41,7 +42,9 @@ class Quantity(_Strict):
     @model_validator(mode="after")
     def _one_meaning(self) -> Self:
         if self.value is not None and (self.guess is not None or self.bounds is not None):
-            raise ValueError("give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both")
+            raise ValueError(
+                "give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both"
+            )
         if self.bounds is not None:
             low, high = self.bounds
             if not low < high:
@@ -141,7 +144,7 @@ class Table(_Strict):
     @field_validator("knots")
     @classmethod
     def _increasing(cls, value: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if value is not None and (len(value) < 2 or any(b <= a for a, b in zip(value, value[1:], strict=False))):
+        if value is not None and (len(value) < 2 or any(b <= a for a, b in pairwise(value))):
             raise ValueError("knots must be at least two and strictly increasing")
         return value
 
@@ -231,6 +234,8 @@ class TwinSpec(_Strict):
         for i, radiator in enumerate(self.radiators):
             yield from self._check_end(f"radiators[{i}].node", radiator.node, nodes)
             yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
+            if (radiator.node, radiator.sink) in [(r.node, r.sink) for r in self.radiators[:i]]:
+                yield f"radiators[{i}]: '{radiator.node}' radiates to '{radiator.sink}' twice; add the areas"
         yield from self._check_loads(nodes)
 
     def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
@@ -238,7 +243,9 @@ class TwinSpec(_Strict):
         for i, conductor in enumerate(self.conductors):
             ends = frozenset(conductor.between)
             for end in conductor.between:
-                yield from self._check_end(f"conductors[{i}].between", end, [*nodes, *self.boundaries], "node or boundary")
+                yield from self._check_end(
+                    f"conductors[{i}].between", end, [*nodes, *self.boundaries], "node or boundary"
+                )
             if ends <= set(self.boundaries):
                 yield f"conductors[{i}].between: joins two boundaries; one end must be a node"
             if ends in pairs:
@@ -250,6 +257,8 @@ class TwinSpec(_Strict):
         for i, load in enumerate(self.loads):
             yield from self._check_end(f"loads[{i}].node", load.node, nodes)
             yield from self._check_channel(f"loads[{i}].channel", load.channel, ("power", "auxiliary"))
+            if (load.channel, load.node) in [(other.channel, other.node) for other in self.loads[:i]]:
+                yield f"loads[{i}]: channel '{load.channel}' heats node '{load.node}' twice; add the weights"
             channel = self.channels[load.channel]
             if load.table is None and channel.kind == "auxiliary":
                 yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
@@ -298,18 +307,47 @@ def _one_line(error: ValidationError) -> str:
     where = ""
     for part in first["loc"]:
         where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "extra_forbidden":
-        message = "unknown field; remove it or correct its spelling"
-    elif first["type"] == "missing":
-        message = "is missing"
-    elif first["type"] != "value_error" and not isinstance(first["input"], dict | list):
-        message += f" (got {first['input']!r})"
+    message = _wording(first)
     return f"{where}: {message}" if where else message
 
 
+_WORDING = {
+    "extra_forbidden": "unknown field; remove it or correct its spelling",
+    "missing": "is missing",
+    "model_type": "must be a mapping of fields",
+    "dict_type": "must be a mapping of names",
+    "tuple_type": "must be a list",
+    "too_short": "must hold more entries",
+    "too_long": "must hold fewer entries",
+    "string_type": "must be text",
+    "string_pattern_mismatch": "is no valid name; begin with a letter and use letters, digits, '_' and '-'",
+    "float_parsing": "must be a number",
+    "float_type": "must be a number",
+    "bool_parsing": "must be true or false",
+    "bool_type": "must be true or false",
+}
+
+
+def _wording(problem: Mapping[str, Any]) -> str:
+    """Return what is wrong in words of the specification rather than of the validator."""
+    kind, given = problem["type"], problem["input"]
+    message = _WORDING.get(kind, problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be"))
+    if kind in ("extra_forbidden", "missing", "value_error") or isinstance(given, dict | list):
+        return message
+    shown = repr(given)
+    return f"{message} (got {shown if len(shown) <= 60 else shown[:57] + '...'})"
+
+
 class _UniqueKeys(yaml.SafeLoader):
-    """A safe YAML loader that refuses a key that stands twice, where YAML would silently keep the last."""
+    """A safe YAML loader that refuses a key that stands twice, where YAML would silently keep the last.
+
+    Times stay text, quoted or not.
+    """
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -317,6 +355,15 @@ class _UniqueKeys(yaml.SafeLoader):
             if key in keys[:i]:
                 raise SpecError(f"line {node.value[i][0].start_mark.line + 1}: '{key}' stands twice")
         return super().construct_mapping(node, deep)
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object, refusing a key that stands twice."""
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise SpecError(f"'{next(n for i, n in enumerate(names) if n in names[:i])}' stands twice")
+    return result
 
 
 def read_mapping(path: Path) -> dict[str, Any]:
@@ -333,15 +380,24 @@ def read_mapping(path: Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a text file"
         raise SpecError(f"{path}: cannot be read ({reason})") from error
     try:
-        data = yaml.load(text, Loader=_UniqueKeys) if Path(path).suffix != ".json" else json.loads(text)
+        if Path(path).suffix == ".json":
+            data = json.loads(text, object_pairs_hook=_unique)
+        else:
+            data = yaml.load(text, Loader=_UniqueKeys)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f"line {mark.line + 1}: " if mark else ""
-        raise SpecError(f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})") from error
+        raise SpecError(
+            f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})"
+        ) from error
     except json.JSONDecodeError as error:
         raise SpecError(f"{path}: line {error.lineno}: not valid JSON ({error.msg})") from error
+    except RecursionError as error:
+        raise SpecError(f"{path}: is nested too deeply") from error
     except SpecError as error:
         raise SpecError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise SpecError(f"{path}: holds a number of too many digits") from error
     if not isinstance(data, dict):
         raise SpecError(f"{path}: the top level must be a mapping of fields, got {type(data).__name__}")
     return data
