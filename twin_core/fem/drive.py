@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.fem.scenario import Scenario
-from twin_core.fem.signals import Path
+from twin_core.fem.signals import Path, Span
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,12 @@ def generator(scenario: Scenario, purpose: str) -> np.random.Generator:
 
 def realise(scenario: Scenario, clock: Clock) -> dict[str, Path]:
     """Return every forcing as a function of time; held ones are those samples, each until the next."""
-    span = float(clock.start_s[0]) - scenario.time.sample_s, float(clock.ends_s[-1]) + scenario.time.sample_s
+    start_s = float(clock.start_s[0]) - scenario.time.sample_s
+    stop_s = float(clock.ends_s[-1]) + scenario.time.sample_s
     paths = {}
     for name, forcing in scenario.forcings.items():
-        path = forcing.signal.realise(*span, generator(scenario, f"forcing {name}"))
+        rng = generator(scenario, f"forcing {name}")
+        path = forcing.signal.realise(Span(start_s, stop_s, rng, scenario.epoch_ns))
         paths[name] = _held(path, scenario.time.sample_s) if forcing.is_held else path
     return paths
 

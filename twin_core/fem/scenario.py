@@ -159,6 +159,9 @@ class Scenario(Part):
         for name, boundary in self.boundaries.items():
             if boundary.forcing is not None:
                 yield from self._forcing_problem(f"boundaries.{name}.forcing", boundary.forcing, "temperature")
+        for name, forcing in self.forcings.items():
+            if forcing.signal.needs_date and self.time.start is None:
+                yield f"forcings.{name}.signal: an orbit needs a date; give time.start"
         for i, load in enumerate(self.loads):
             yield from self._forcing_problem(f"loads[{i}].forcing", load.forcing, "power")
             yield from self._place_problem(f"loads[{i}].place", load.place, ids)
