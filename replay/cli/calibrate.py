@@ -31,10 +31,10 @@ def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, out: Pa
     check_suffix(out, (".json",))
     spec = load_spec(spec_file)
     records = load_records(telemetry, spec)
-    notify([notice for record in records for notice in record.notices])
     with progress_bar("calibrating") as progress:
         model = fit(spec, records, method=method, progress=progress)
     write_text(out, to_json(model.to_json()))
+    notify([notice for record in records for notice in record.notices])
     if as_json:
         print_line(to_json({"out": str(out)} | model.summary).rstrip())
     else:

@@ -47,13 +47,11 @@ def close_loop(
     from twin_core.discover import close_loop as run
     from twin_core.network.spec import load_spec
 
-    _check(holdout, holdout_telemetry, burn_in, out)
+    _check(holdout, holdout_telemetry, burn_in, false_alarm_rate, out)
     spec = load_spec(spec_file)
     records = load_records(telemetry, spec)
     held_out = load_records(holdout_telemetry, spec)
     check_apart(records, held_out)
-    notices = [notice for record in (*records, *held_out) for notice in record.notices]
-    notify(notices)
     with progress_bar("closing the loop") as progress:
         loop = run(
             spec,
@@ -65,6 +63,7 @@ def close_loop(
             progress=progress,
         )
     _save(loop, out)
+    notify([notice for record in (*records, *held_out) for notice in record.notices])
     if as_json:
         print_line(to_json(loop.report).rstrip())
     else:
@@ -72,7 +71,13 @@ def close_loop(
         print_line(f"wrote {out}/report.html, report.json, model.json")
 
 
-def _check(holdout: float | None, holdout_telemetry: tuple[Path, ...], burn_in: float | None, out: Path) -> None:
+def _check(
+    holdout: float | None,
+    holdout_telemetry: tuple[Path, ...],
+    burn_in: float | None,
+    false_alarm_rate: float,
+    out: Path,
+) -> None:
     """Refuse options that contradict each other, before anything is read."""
     if holdout is not None and holdout_telemetry:
         raise click.UsageError("--holdout and --holdout-telemetry exclude each other; give one of them")
@@ -82,6 +87,8 @@ def _check(holdout: float | None, holdout_telemetry: tuple[Path, ...], burn_in: 
         raise click.UsageError("--burn-in belongs to --holdout-telemetry")
     if burn_in is not None and not 0.0 <= burn_in < float("inf"):
         raise click.UsageError(f"--burn-in must be a number of seconds (got {burn_in:g})")
+    if not 0.0 < false_alarm_rate < 0.5:
+        raise click.UsageError(f"--false-alarm-rate must be between 0 and 0.5, exclusive (got {false_alarm_rate:g})")
     if out.exists() and not out.is_dir():
         raise click.UsageError(f"--out {out} is a file; name a folder")
 

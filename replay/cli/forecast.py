@@ -47,10 +47,10 @@ def forecast(
     model = load_model(model_file)
     record = load_record(telemetry[0], model.spec)
     planned = _load_plan(plan, record, model) if plan else None
-    notify([*record.notices, *(planned.notices if planned else ())])
     result = look_ahead(model, record, horizon, step_s=step, plan=planned)
     document = _document(result, record, model)
     _write(out, document)
+    notify(record.notices)
     if as_json:
         print_line(to_json(document).rstrip())
     else:

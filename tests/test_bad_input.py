@@ -1,0 +1,314 @@
+"""Bad input: exit code 2, one line on stderr that names file and place, no traceback, nothing left behind."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from replay.cli.main import main
+
+Edit = Callable[[dict[str, Any]], None]
+DELETED = object()
+
+
+def edit(*path: str | int, to: Any = DELETED) -> Edit:
+    """Return a change of one field of a nested document."""
+
+    def change(document: Any) -> None:
+        for key in path[:-1]:
+            document = document[key]
+        if to is DELETED:
+            del document[path[-1]]
+        else:
+            document[path[-1]] = to
+
+    return change
+
+
+SPECIFICATIONS: list[tuple[Edit, str]] = [
+    (edit("twin"), "twin: is missing"),
+    (edit("twin", to="Bench Sat"), "twin: is no valid name"),
+    (edit("twin", to=7), "twin: must be text"),
+    (edit("colour", to="red"), "colour: unknown field"),
+    (edit("channels"), "channels: is missing"),
+    (edit("channels", to=["T_a"]), "channels: must be a mapping"),
+    (edit("channels", "T_a", to="degC"), "channels.T_a: must be a mapping"),
+    (edit("channels", "T_a", "kind", to="temp"), "channels.T_a.kind"),
+    (edit("channels", "T_a", "unit", to="F"), "channels.T_a: unit of a temperature channel is K or degC"),
+    (edit("channels", "T_a", "noise_std", to=0), "channels.T_a.noise_std: must be greater than 0"),
+    (edit("channels", "Q_a", "unit", to="kW"), "channels.Q_a: unit of a power channel is W or percent"),
+    (edit("channels", "Q_a", "noise_std", to=1.0), "channels.Q_a: noise_std"),
+    (edit("channels", "Q_a", "interpolation", to="cubic"), "channels.Q_a.interpolation"),
+    (edit("channels", "Q_a", "levels", to=True), "channels.Q_a: only an auxiliary channel has levels"),
+    (edit("nodes", to=[]), "nodes: must hold more entries"),
+    (edit("nodes", to={"a": 1}), "nodes: must be a list"),
+    (edit("nodes", 0, to="a"), "nodes[0]: must be a mapping"),
+    (edit("nodes", 0, "id", to="a b"), "nodes[0].id: is no valid name"),
+    (edit("nodes", 1, "id", to="a"), "nodes[1].id: 'a' is declared twice"),
+    (edit("nodes", 0, "capacity", to={"guess": 2}), "nodes[0].capacity: unknown field"),
+    (edit("nodes", 0, "sensor", to="T_z"), "nodes[0].sensor: unknown channel 'T_z'"),
+    (edit("nodes", 0, "sensor", to="Q_a"), "nodes[0].sensor: channel 'Q_a' is power"),
+    (edit("nodes", 1, "sensor", to="T_a"), "nodes[1].sensor: 'T_a' already reads node 'a'"),
+    (edit("nodes", 0, "capacity_J_per_K", to=5.0), "nodes[0].capacity_J_per_K: must be a mapping"),
+    (edit("nodes", 0, "capacity_J_per_K", "guess", to=-5), "nodes[0].capacity_J_per_K.guess: must be greater than 0"),
+    (edit("nodes", 0, "capacity_J_per_K", "guess", to="big"), "nodes[0].capacity_J_per_K.guess: must be a number"),
+    (edit("nodes", 0, "capacity_J_per_K", "guess", to=True), "nodes[0].capacity_J_per_K.guess: must be a number"),
+    (edit("nodes", 0, "capacity_J_per_K", to={"value": 1, "guess": 2}), "nodes[0].capacity_J_per_K: give either"),
+    (edit("nodes", 0, "capacity_J_per_K", to={"guess": 2, "bounds": [3, 4]}), "guess 2 lies outside its bounds"),
+    (edit("nodes", 0, "capacity_J_per_K", to={"bounds": [4, 1]}), "bounds contradict each other"),
+    (edit("boundaries", "space", to={}), "boundaries.space: give exactly one of"),
+    (edit("boundaries", "space", "value_K", to=-1), "boundaries.space.value_K"),
+    (edit("boundaries", "space", to={"channel": "T_z"}), "boundaries.space.channel: unknown channel 'T_z'"),
+    (edit("boundaries", "a", to={"value_K": 3}), "boundaries.a: a node has the same id"),
+    (edit("conductors", 0, "between", to=["a", "z"]), "conductors[0].between: unknown node or boundary 'z'"),
+    (edit("conductors", 0, "between", to=["a", "a"]), "conductors[0].between: joins 'a' to itself"),
+    (edit("conductors", 0, "conductance_W_per_K", "guess", to=0), "conductors[0].conductance_W_per_K.guess"),
+    (edit("radiators", 0, "emissivity", to=1.2), "radiators[0].emissivity: must be less than or equal to 1"),
+    (edit("radiators", 0, "emissivity", to=float("nan")), "radiators[0].emissivity"),
+    (edit("radiators", 0, "area_m2"), "radiators[0].area_m2: is missing"),
+    (edit("radiators", 0, "sink", to="b"), "radiators[0].sink: unknown boundary 'b'"),
+    (edit("loads", 0, "channel", to="T_a"), "loads[0].channel: channel 'T_a' is temperature"),
+    (edit("loads", 0, "node", to="z"), "loads[0].node: unknown node 'z'"),
+    (edit("loads", 0, "weight", to=2.0), "loads[0].weight"),
+    (edit("loads", 0, "table", to={"knots": [1]}), "loads[0].table.knots"),
+    (edit("loads", 0, "solar", to="maybe"), "loads[0].solar: must be true or false"),
+    (edit("exclude", to=[{"start": "yesterday", "stop": 3}]), "exclude[0].start"),
+    (edit("exclude", to=[{"start": 5, "stop": 3}]), "exclude[0]: stop must come after start"),
+    (edit("exclude", to=[{"start": 5, "stop": 9}]), "exclude[0].start: is a number of seconds"),
+    (edit("criteria", to={"bias": 1}), "criteria.bias: unknown field"),
+    (edit("criteria", to={"bias_K": float("inf")}), "criteria.bias_K"),
+]
+
+TEXTS: list[tuple[str, str, str]] = [
+    ("spec.yaml", "", "the top level must be a mapping"),
+    ("spec.yaml", "- a\n- b\n", "the top level must be a mapping"),
+    ("spec.yaml", "twin: x\nnodes: [a\n", "line 3: not valid YAML"),
+    ("spec.yaml", "twin: x\ntwin: y\n", "line 2: 'twin' stands twice"),
+    ("spec.yaml", "[" * 3000, "nested too deeply"),
+    ("spec.yaml", "twin: !!python/object:os.system {}\n", "line 1: not valid YAML"),
+    ("spec.json", '{"twin": "x",\n', "line 2: not valid JSON"),
+    ("spec.json", '{"twin": "x", "twin": "y"}', "'twin' stands twice"),
+    ("spec.json", '{"twin": ' + "9" * 5000 + "}", "too many digits"),
+]
+
+HEAD = "time,T_a,T_b,Q_a\n"
+ROW = "2026-01-01T00:0{}:00Z,20,293,5\n"
+TELEMETRY: list[tuple[str | bytes, str]] = [
+    ("", "is empty"),
+    (HEAD, "has a header but no rows"),
+    (b"\x89PNG\r\n\x1a\n\x00\x00\xff", "row 1: not text in UTF-8"),
+    (HEAD.encode() + b"2026-01-01T00:00:00Z,1\x00,2,3\n", "row 2: holds a NUL byte"),
+    (HEAD.replace(",", ";") + ROW.format(0).replace(",", ";"), "row 1: columns must be separated by commas"),
+    ("stamp,T_a,T_b,Q_a\n" + ROW.format(0), "row 1: the first column is 'stamp'"),
+    ("time,T_a,T_a,Q_a\n" + ROW.format(0), "row 1: column 'T_a' stands twice"),
+    ("time,T_a,Q_a\n2026-01-01T00:00:00Z,20,5\n", "channel 'T_b' of the specification has no column"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,293\n", "row 3: has 3 fields, the header has 4"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,293,5,6\n", "row 3: has 5 fields, the header has 4"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,warm,293,5\n", "row 3: column 'T_a' holds 'warm'"),
+    (HEAD + "\n\n" + ROW.format(0) + "2026-01-01T00:01:00Z,20,293,on\n", "row 5: column 'Q_a' holds 'on'"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,inf,293,5\n", "row 3: column 'T_a'"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,nan,293,5\n", "row 3: column 'T_a' holds 'nan'"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,1e999,5\n", "row 3: column 'T_b'"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,-300,293,5\n", "row 3: column 'T_a' holds -300 degC, which is below"),
+    (
+        HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,-1,5\n",
+        "row 3: column 'T_b' holds -1 K, which is below absolute",
+    ),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,9999,293,5\n", "row 3: column 'T_a' holds 9999 degC, which is above"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,293,1e30\n", "row 3: column 'Q_a'"),
+    (HEAD + ROW.format(1) + ROW.format(0), "row 3: column 'time' is earlier than the row before"),
+    (HEAD + ROW.format(0) + ROW.format(0), "row 3: column 'time' repeats the time of the row before"),
+    (HEAD + "2026-01-01T00:00:00,20,293,5\n", "row 2: column 'time' holds '2026-01-01T00:00:00', which names no UTC"),
+    (HEAD + "yesterday,20,293,5\n", "row 2: column 'time' holds 'yesterday', which is not an RFC 3339 instant"),
+    (HEAD + "2026-02-30T00:00:00Z,20,293,5\n", "row 2: column 'time' holds '2026-02-30T00:00:00Z', which is no date"),
+    (HEAD + "1767225600,20,293,5\n", "or name the column time_s"),
+    (HEAD + ",20,293,5\n", "row 2: column 'time' is empty"),
+    (HEAD.replace("time", "time_s") + "0,20,293,5\n,20,293,5\n", "row 3: column 'time_s' is empty"),
+    (HEAD.replace("time", "time_s") + "soon,20,293,5\n", "row 2: column 'time_s' holds 'soon'"),
+    (HEAD + '2026-01-01T00:00:00Z,"20,293,5\n', "row 2: "),
+    (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples"),
+]
+
+Arguments = tuple[list[str], str]
+ARGUMENTS: list[Arguments] = [
+    (["frobnicate"], "No such command 'frobnicate'"),
+    (["calibrate"], "Missing option '--spec'"),
+    (["calibrate", "--spec", "spec.yaml", "--out", "x.json"], "Missing option '--telemetry'"),
+    (
+        ["calibrate", "--spec", "absent.yaml", "--telemetry", "data.csv", "--out", "x.json"],
+        "absent.yaml: cannot be read",
+    ),
+    (
+        ["calibrate", "--spec", "spec.yaml", "--telemetry", "absent.csv", "--out", "x.json"],
+        "absent.csv: cannot be read",
+    ),
+    (
+        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.txt", "--out", "x.json"],
+        "data.txt: the name must end in",
+    ),
+    (["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x.txt"], "x.txt: the name must end in"),
+    (
+        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--method", "magic", "--out", "x.json"],
+        "--method",
+    ),
+    (["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "data.csv", "--out", "x.json"], "is named twice"),
+    (
+        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "undated.csv", "--out", "x.json"],
+        "undated.csv: counts seconds, data.csv is dated",
+    ),
+    (["calibrate", "--spec", "spec.yaml", "--telemetry", "broken.mcap", "--out", "x.json"], "broken.mcap: "),
+    (["calibrate", "--spec", ".", "--telemetry", "data.csv", "--out", "x.json"], "cannot be read (Is a directory)"),
+    (["simulate", "--scenario", "absent.yaml", "--out", "x.csv"], "absent.yaml: cannot be read"),
+    (["simulate", "--scenario", "spec.yaml", "--out", "x.csv"], "spec.yaml: "),
+    (["simulate", "--scenario", "spec.yaml", "--out", "x.png"], "x.png: the name must end in .csv or .mcap"),
+    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--holdout", "1.5"], "--holdout"),
+    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--holdout", "half"], "--holdout"),
+    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--burn-in", "9"], "--burn-in"),
+    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "data.csv"], "--out data.csv is a file"),
+    (
+        ["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--false-alarm-rate", "2"],
+        "false-alarm-rate",
+    ),
+    (
+        [
+            "close-loop",
+            "--spec",
+            "spec.yaml",
+            "--telemetry",
+            "data.csv",
+            "--holdout-telemetry",
+            "data.csv",
+            "--out",
+            "x",
+        ],
+        "data.csv: is both telemetry and hold-out",
+    ),
+    (
+        [
+            "close-loop",
+            "--spec",
+            "spec.yaml",
+            "--telemetry",
+            "data.csv",
+            "--holdout-telemetry",
+            "b.csv",
+            "--out",
+            "x",
+            "--holdout",
+            "0.2",
+        ],
+        "--holdout and --holdout-telemetry exclude each other",
+    ),
+    (
+        [
+            "close-loop",
+            "--spec",
+            "spec.yaml",
+            "--telemetry",
+            "data.csv",
+            "--holdout-telemetry",
+            "copy.csv",
+            "--out",
+            "x",
+        ],
+        "copy.csv: overlaps data.csv in time",
+    ),
+    (
+        ["forecast", "--model", "absent.json", "--telemetry", "data.csv", "--horizon", "60", "--out", "x.csv"],
+        "absent.json: cannot be read",
+    ),
+    (
+        ["forecast", "--model", "spec.json", "--telemetry", "data.csv", "--horizon", "60", "--out", "x.csv"],
+        "spec.json: format: not a model file",
+    ),
+    (["forecast", "--model", "m.json", "--telemetry", "data.csv", "--horizon", "soon", "--out", "x.csv"], "--horizon"),
+    (["replay", "absent.mcap", "--url", "http://127.0.0.1:9", "--twin", "x"], "absent.mcap: cannot be read"),
+    (["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x"], "broken.mcap: not a complete MCAP file"),
+    (["replay", "broken.mcap", "--url", "localhost", "--twin", "x"], "--url must begin with http://"),
+    (
+        ["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x", "--rate", "-1"],
+        "--rate must be a positive",
+    ),
+    (
+        ["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x", "--map", "a"],
+        "--map must read TOPIC=CHANNEL",
+    ),
+    (["serve", "--host", "0.0.0.0"], "TWIN_API_KEYS"),
+    (["serve", "--port", "99999"], "TWIN_PORT"),
+    (["demo", "--effect", "gremlins", "--out", "x"], "unknown effect 'gremlins'"),
+    (["demo", "--seed", "-1", "--out", "x"], "--seed"),
+    (["demo", "--out", "data.csv"], "--out data.csv is a file"),
+]
+
+
+@pytest.fixture
+def desk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: dict[str, Any], pair_telemetry: Callable[[int], str]
+) -> Path:
+    """A folder with a good specification, good telemetry and a few bad files, as the working directory."""
+    (tmp_path / "spec.yaml").write_text(yaml.safe_dump(pair))
+    (tmp_path / "spec.json").write_text(json.dumps(pair))
+    (tmp_path / "data.csv").write_text(pair_telemetry(40))
+    (tmp_path / "data.txt").write_text(pair_telemetry(40))
+    (tmp_path / "copy.csv").write_text(pair_telemetry(40))
+    (tmp_path / "undated.csv").write_text("time_s,T_a,T_b,Q_a\n0,20,293,5\n")
+    (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(40))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def refuse(argv: Sequence[str], desk: Path, capsys: pytest.CaptureFixture[str], *expected: str) -> None:
+    """Assert that the command line refuses its input as it must."""
+    before = sorted(path.name for path in desk.iterdir())
+    code = main(argv)
+    printed = capsys.readouterr()
+    assert code == 2, printed.err
+    assert printed.err.count("\n") == 1 and printed.err.startswith("twin: ")
+    assert "Traceback" not in printed.err and printed.out == ""
+    for text in expected:
+        assert text in printed.err
+    assert sorted(path.name for path in desk.iterdir()) == before
+
+
+@pytest.mark.parametrize(("change", "expected"), SPECIFICATIONS, ids=[case[1] for case in SPECIFICATIONS])
+def test_specification(
+    change: Edit, expected: str, desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    change(pair)
+    (desk / "spec.yaml").write_text(yaml.safe_dump(pair))
+    argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
+    refuse(argv, desk, capsys, expected)
+
+
+@pytest.mark.parametrize(("name", "text", "expected"), TEXTS, ids=[f"{n}-{e}" for n, _, e in TEXTS])
+def test_specification_file(
+    name: str, text: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (desk / name).write_text(text)
+    refuse(["close-loop", "--spec", name, "--telemetry", "data.csv", "--out", "loop"], desk, capsys, name, expected)
+
+
+@pytest.mark.parametrize(("content", "expected"), TELEMETRY, ids=[case[1] for case in TELEMETRY])
+def test_telemetry(content: str | bytes, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (desk / "data.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
+    argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
+    refuse(argv, desk, capsys, "data.csv", expected)
+
+
+@pytest.mark.parametrize(("argv", "expected"), ARGUMENTS, ids=[case[1] for case in ARGUMENTS])
+def test_arguments(argv: list[str], expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refuse(argv, desk, capsys, expected)
+
+
+@pytest.mark.parametrize(
+    "argv", [ARGUMENTS[0][0], ARGUMENTS[3][0], ARGUMENTS[4][0]], ids=["usage", "spec", "telemetry"]
+)
+def test_real_process(argv: list[str], desk: Path) -> None:
+    run = subprocess.run([sys.executable, "-m", "replay.cli.main", *argv], capture_output=True, text=True, timeout=120)
+    assert run.returncode == 2
+    assert run.stdout == "" and run.stderr.count("\n") == 1 and run.stderr.startswith("twin: ")
