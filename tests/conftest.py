@@ -36,6 +36,12 @@ def no_settings_from_outside() -> Iterator[None]:
     os.environ.update(kept)
 
 
+@pytest.fixture(scope="session")
+def pair_declared() -> dict[str, Any]:
+    """A specification of two nodes, not to be changed."""
+    return PAIR
+
+
 @pytest.fixture
 def pair() -> dict[str, Any]:
     """A specification of two nodes, to be changed at will."""

@@ -134,131 +134,113 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
     (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples"),
 ]
 
-Arguments = tuple[list[str], str]
-ARGUMENTS: list[Arguments] = [
-    (["frobnicate"], "No such command 'frobnicate'"),
-    (["calibrate"], "Missing option '--spec'"),
-    (["calibrate", "--spec", "spec.yaml", "--out", "x.json"], "Missing option '--telemetry'"),
+ARGUMENTS: list[tuple[str, str]] = [
+    ("frobnicate", "No such command 'frobnicate'"),
+    ("calibrate", "Missing option '--spec'"),
+    ("calibrate --spec spec.yaml --out x.json", "Missing option '--telemetry'"),
+    ("calibrate --spec absent.yaml --telemetry data.csv --out x.json", "absent.yaml: cannot be read"),
+    ("calibrate --spec spec.yaml --telemetry absent.csv --out x.json", "absent.csv: cannot be read"),
+    ("calibrate --spec spec.yaml --telemetry data.txt --out x.json", "data.txt: the name must end in"),
+    ("calibrate --spec spec.yaml --telemetry data.csv --out x.txt", "x.txt: the name must end in"),
+    ("calibrate --spec spec.yaml --telemetry data.csv --out no/x.json", "no/x.json: cannot be written"),
+    ("calibrate --spec spec.yaml --telemetry data.csv --method magic --out x.json", "--method"),
+    ("calibrate --spec spec.yaml --telemetry data.csv data.csv --out x.json", "data.csv: is named twice"),
+    ("calibrate --spec spec.yaml --telemetry data.csv undated.csv --out x.json", "counts seconds, data.csv is dated"),
+    ("calibrate --spec spec.yaml --telemetry broken.mcap --out x.json", "broken.mcap: not a complete MCAP file"),
+    ("calibrate --spec . --telemetry data.csv --out x.json", "cannot be read (Is a directory)"),
+    ("simulate --scenario absent.yaml --out x.csv", "absent.yaml: cannot be read"),
+    ("simulate --scenario spec.yaml --out x.csv", "spec.yaml: "),
+    ("simulate --scenario spec.yaml --out x.png", "x.png: the name must end in .csv or .mcap"),
+    ("close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 1.5", "--holdout must be between 0 and 1"),
+    ("close-loop --spec spec.yaml --telemetry data.csv --out x --holdout half", "--holdout"),
+    ("close-loop --spec spec.yaml --telemetry data.csv --out x --burn-in 9", "--burn-in belongs to"),
+    ("close-loop --spec spec.yaml --telemetry data.csv --out data.csv", "--out data.csv is a file"),
+    ("close-loop --spec spec.yaml --telemetry data.csv --out x --false-alarm-rate 2", "--false-alarm-rate must be"),
     (
-        ["calibrate", "--spec", "absent.yaml", "--telemetry", "data.csv", "--out", "x.json"],
-        "absent.yaml: cannot be read",
-    ),
-    (
-        ["calibrate", "--spec", "spec.yaml", "--telemetry", "absent.csv", "--out", "x.json"],
-        "absent.csv: cannot be read",
-    ),
-    (
-        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.txt", "--out", "x.json"],
-        "data.txt: the name must end in",
-    ),
-    (["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x.txt"], "x.txt: the name must end in"),
-    (
-        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--method", "magic", "--out", "x.json"],
-        "--method",
-    ),
-    (["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "data.csv", "--out", "x.json"], "is named twice"),
-    (
-        ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "undated.csv", "--out", "x.json"],
-        "undated.csv: counts seconds, data.csv is dated",
-    ),
-    (["calibrate", "--spec", "spec.yaml", "--telemetry", "broken.mcap", "--out", "x.json"], "broken.mcap: "),
-    (["calibrate", "--spec", ".", "--telemetry", "data.csv", "--out", "x.json"], "cannot be read (Is a directory)"),
-    (["simulate", "--scenario", "absent.yaml", "--out", "x.csv"], "absent.yaml: cannot be read"),
-    (["simulate", "--scenario", "spec.yaml", "--out", "x.csv"], "spec.yaml: "),
-    (["simulate", "--scenario", "spec.yaml", "--out", "x.png"], "x.png: the name must end in .csv or .mcap"),
-    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--holdout", "1.5"], "--holdout"),
-    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--holdout", "half"], "--holdout"),
-    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--burn-in", "9"], "--burn-in"),
-    (["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "data.csv"], "--out data.csv is a file"),
-    (
-        ["close-loop", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "x", "--false-alarm-rate", "2"],
-        "false-alarm-rate",
-    ),
-    (
-        [
-            "close-loop",
-            "--spec",
-            "spec.yaml",
-            "--telemetry",
-            "data.csv",
-            "--holdout-telemetry",
-            "data.csv",
-            "--out",
-            "x",
-        ],
+        "close-loop --spec spec.yaml --telemetry data.csv --holdout-telemetry data.csv --out x",
         "data.csv: is both telemetry and hold-out",
     ),
     (
-        [
-            "close-loop",
-            "--spec",
-            "spec.yaml",
-            "--telemetry",
-            "data.csv",
-            "--holdout-telemetry",
-            "b.csv",
-            "--out",
-            "x",
-            "--holdout",
-            "0.2",
-        ],
+        "close-loop --spec spec.yaml --telemetry data.csv --holdout-telemetry b.csv --holdout 0.2 --out x",
         "--holdout and --holdout-telemetry exclude each other",
     ),
     (
-        [
-            "close-loop",
-            "--spec",
-            "spec.yaml",
-            "--telemetry",
-            "data.csv",
-            "--holdout-telemetry",
-            "copy.csv",
-            "--out",
-            "x",
-        ],
+        "close-loop --spec spec.yaml --telemetry data.csv --holdout-telemetry copy.csv --out x",
         "copy.csv: overlaps data.csv in time",
     ),
-    (
-        ["forecast", "--model", "absent.json", "--telemetry", "data.csv", "--horizon", "60", "--out", "x.csv"],
-        "absent.json: cannot be read",
-    ),
-    (
-        ["forecast", "--model", "spec.json", "--telemetry", "data.csv", "--horizon", "60", "--out", "x.csv"],
-        "spec.json: format: not a model file",
-    ),
-    (["forecast", "--model", "m.json", "--telemetry", "data.csv", "--horizon", "soon", "--out", "x.csv"], "--horizon"),
-    (["replay", "absent.mcap", "--url", "http://127.0.0.1:9", "--twin", "x"], "absent.mcap: cannot be read"),
-    (["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x"], "broken.mcap: not a complete MCAP file"),
-    (["replay", "broken.mcap", "--url", "localhost", "--twin", "x"], "--url must begin with http://"),
-    (
-        ["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x", "--rate", "-1"],
-        "--rate must be a positive",
-    ),
-    (
-        ["replay", "broken.mcap", "--url", "http://127.0.0.1:9", "--twin", "x", "--map", "a"],
-        "--map must read TOPIC=CHANNEL",
-    ),
-    (["serve", "--host", "0.0.0.0"], "TWIN_API_KEYS"),
-    (["serve", "--port", "99999"], "TWIN_PORT"),
-    (["demo", "--effect", "gremlins", "--out", "x"], "unknown effect 'gremlins'"),
-    (["demo", "--seed", "-1", "--out", "x"], "--seed"),
-    (["demo", "--out", "data.csv"], "--out data.csv is a file"),
+    ("forecast --model absent.json --telemetry data.csv --horizon 60 --out x.csv", "absent.json: cannot be read"),
+    ("forecast --model spec.json --telemetry data.csv --horizon 60 --out x.csv", "spec.json: format: not a model"),
+    ("forecast --model model.json --telemetry data.csv --horizon soon --out x.csv", "--horizon"),
+    ("forecast --model model.json --telemetry data.csv --horizon -60 --out x.csv", "horizon_s: must be a positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon inf --out x.csv", "horizon_s: must be a positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv", "step_s: must be positive"),
+    ("forecast --model model.json --telemetry data.csv copy.csv --horizon 60 --out x.csv", "copy.csv: a forecast"),
+    ("forecast --model model.json --telemetry data.csv --horizon 60 --out x.txt", "x.txt: the name must end in"),
+    ("replay absent.mcap --url http://127.0.0.1:9 --twin x", "absent.mcap: cannot be read"),
+    ("replay broken.mcap --url http://127.0.0.1:9 --twin x", "broken.mcap: not a complete MCAP file"),
+    ("replay broken.mcap --url localhost --twin x", "--url must begin with http://"),
+    ("replay broken.mcap --url http://127.0.0.1:9 --twin x --rate -1", "--rate must be a positive number or max"),
+    ("replay broken.mcap --url http://127.0.0.1:9 --twin x --map a", "--map must read TOPIC=CHANNEL"),
+    ("serve --host 0.0.0.0", "TWIN_API_KEYS"),
+    ("serve --port 99999", "TWIN_PORT"),
+    ("demo --effect gremlins --out x", "unknown effect 'gremlins'"),
+    ("demo --seed -1 --out x", "--seed"),
+    ("demo --out data.csv", "--out data.csv is a file"),
 ]
+
+MODELS: list[tuple[Edit, str]] = [
+    (edit("format", to="something else"), "format: not a model file"),
+    (edit("values"), "values: is missing"),
+    (edit("values", "C:a"), "values.C:a: is missing"),
+    (edit("values", "C:a", to="big"), "model file is damaged"),
+    (edit("values", "C:a", to=float("nan")), "values.C:a: is not a finite number"),
+    (edit("covariance", to=[[1.0]]), "model file is damaged"),
+    (edit("noise_K", "T_a"), "T_a: is missing"),
+    (edit("spec", "twin", to="!"), "twin: is no valid name"),
+    (edit("effects", to=[{"effect": "gremlins", "where": {"node": "a"}}]), "gremlins"),
+]
+
+PLANS: list[tuple[str, str]] = [
+    ("time,Q_z\n2026-01-01T00:40:00Z,5\n", "plan.csv: has columns that the specification does not name: Q_z"),
+    ("time,T_a\n2026-01-01T00:40:00Z,5\n", "plan.csv: plans no input"),
+    ("time_s,Q_a\n5,5\n", "plan.csv: must write time in the form of data.csv"),
+    ("time,Q_a\n2026-01-01T00:40:00Z,much\n", "plan.csv: row 2: column 'Q_a' holds 'much'"),
+]
+
+
+@pytest.fixture(scope="session")
+def model_text(
+    tmp_path_factory: pytest.TempPathFactory, pair_declared: dict[str, Any], pair_telemetry: Callable[[int], str]
+) -> str:
+    """The text of a good model file."""
+    folder = tmp_path_factory.mktemp("model")
+    (folder / "spec.yaml").write_text(yaml.safe_dump(pair_declared))
+    (folder / "data.csv").write_text(pair_telemetry(200))
+    argv = f"calibrate --spec {folder}/spec.yaml --telemetry {folder}/data.csv --out {folder}/model.json --json"
+    assert main(argv.split()) == 0
+    return (folder / "model.json").read_text()
 
 
 @pytest.fixture
 def desk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: dict[str, Any], pair_telemetry: Callable[[int], str]
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    pair: dict[str, Any],
+    pair_telemetry: Callable[[int], str],
+    model_text: str,
+    capsys: pytest.CaptureFixture[str],
 ) -> Path:
     """A folder with a good specification, good telemetry and a few bad files, as the working directory."""
     (tmp_path / "spec.yaml").write_text(yaml.safe_dump(pair))
     (tmp_path / "spec.json").write_text(json.dumps(pair))
+    (tmp_path / "model.json").write_text(model_text)
     (tmp_path / "data.csv").write_text(pair_telemetry(40))
     (tmp_path / "data.txt").write_text(pair_telemetry(40))
     (tmp_path / "copy.csv").write_text(pair_telemetry(40))
     (tmp_path / "undated.csv").write_text("time_s,T_a,T_b,Q_a\n0,20,293,5\n")
     (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(40))
     monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
     return tmp_path
 
 
@@ -300,15 +282,32 @@ def test_telemetry(content: str | bytes, expected: str, desk: Path, capsys: pyte
     refuse(argv, desk, capsys, "data.csv", expected)
 
 
-@pytest.mark.parametrize(("argv", "expected"), ARGUMENTS, ids=[case[1] for case in ARGUMENTS])
-def test_arguments(argv: list[str], expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    refuse(argv, desk, capsys, expected)
+@pytest.mark.parametrize(("line", "expected"), ARGUMENTS, ids=[case[1] for case in ARGUMENTS])
+def test_arguments(line: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refuse(line.split(), desk, capsys, expected)
+
+
+@pytest.mark.parametrize(("change", "expected"), MODELS, ids=[case[1] for case in MODELS])
+def test_model_file(change: Edit, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = json.loads((desk / "model.json").read_text())
+    change(model)
+    (desk / "model.json").write_text(json.dumps(model))
+    line = "forecast --model model.json --telemetry data.csv --horizon 600 --out x.csv"
+    refuse(line.split(), desk, capsys, "model.json: ", expected)
+
+
+@pytest.mark.parametrize(("text", "expected"), PLANS, ids=[case[1] for case in PLANS])
+def test_plan(text: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (desk / "plan.csv").write_text(text)
+    line = "forecast --model model.json --telemetry data.csv --horizon 600 --plan plan.csv --out x.json"
+    refuse(line.split(), desk, capsys, expected)
 
 
 @pytest.mark.parametrize(
-    "argv", [ARGUMENTS[0][0], ARGUMENTS[3][0], ARGUMENTS[4][0]], ids=["usage", "spec", "telemetry"]
+    "line", [ARGUMENTS[0][0], ARGUMENTS[3][0], ARGUMENTS[4][0]], ids=["usage", "spec", "telemetry"]
 )
-def test_real_process(argv: list[str], desk: Path) -> None:
-    run = subprocess.run([sys.executable, "-m", "replay.cli.main", *argv], capture_output=True, text=True, timeout=120)
+def test_real_process(line: str, desk: Path) -> None:
+    command = [sys.executable, "-m", "replay.cli.main", *line.split()]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert run.returncode == 2
     assert run.stdout == "" and run.stderr.count("\n") == 1 and run.stderr.startswith("twin: ")
