@@ -181,14 +181,14 @@ def _linear_model(
     noise_K: FloatArray,
 ) -> LinearModel:
     """Return the linear model of all steps about their starts."""
-    ends, transition = one_step(network, network.parameters.values, forcing, starts_K)
-    offset = ends - np.einsum("kij,kj->ki", transition, starts_K)
+    steps = one_step(network, network.parameters.values, forcing, starts_K)
+    offset = steps.ends_K - np.einsum("kij,kj->ki", steps.transition, starts_K)
     process = density * forcing.step_s[:, None]
     process_cov = process[:, :, None] * np.eye(density.size)
     observation = np.zeros((noise_K.size, density.size))
     observation[np.arange(noise_K.size), network.sensor_node] = 1.0
     return LinearModel.build(
-        transition=transition,
+        transition=steps.transition,
         process_cov=process_cov,
         offset=offset,
         observation=observation,

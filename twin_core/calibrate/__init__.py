@@ -48,7 +48,7 @@ def calibrate(
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
     from twin_core.calibrate.second_order import fit_network, to_model
 
-    calibration = fit_network(spec, records, progress=progress)
+    _, calibration = fit_network(spec, records, progress=progress)
     model = to_model(calibration, ())
     progress(1.0, "calibrated")
     return model

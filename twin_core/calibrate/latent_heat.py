@@ -28,6 +28,11 @@ LENGTH_SHARES = (0.004, 0.02, 0.08)
 """Correlation lengths of the latent heat that are compared, as shares of the longest segment."""
 
 FLOOR_SHARE = 1e-3
+LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
+START_SHARES = (1.0, 0.03)
+SMALLEST_LOG_STEP, SETTLED_LOG_STEP, LARGEST_LOG_STEP = 0.1, 0.3, 2.5
+SETTLED_NATS = 0.2
+"""A pass that adds less than this to the log-likelihood is the last."""
 COLUMNS_AT_ONCE = 192
 
 
@@ -98,6 +103,16 @@ class HeatFit:
         """Physical values, (n_parameters,)."""
         return self.problem.network.parameters.to_values(self.free)
 
+    @property
+    def log_posterior(self) -> float:
+        """Log-likelihood of the readings less what the priors of the parameters hold against them."""
+        parameters = self.problem.network.parameters
+        return self.log_likelihood - 0.5 * float((((self.free - parameters.free) / parameters.prior_std) ** 2).sum())
+
+    def unknowns(self) -> FloatArray:
+        """Return the unknown vector of the trajectory problem here: parameters and smoothed initial temperatures."""
+        return np.concatenate([self.free, *(n.starts_K[0] for n in self.nominals)])
+
 
 def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
     """Return temperatures at every grid point, (n_steps + 1, n_nodes), interpolated from the readings."""
@@ -108,11 +123,19 @@ def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
 
 
 def linearise(
-    problem: Problem, values: FloatArray, segment: Segment, states_K: FloatArray, extra_W: FloatArray
+    problem: Problem,
+    values: FloatArray,
+    segment: Segment,
+    states_K: FloatArray,
+    extra_W: FloatArray,
+    near_K: FloatArray | None = None,
 ) -> Nominal:
-    """Return a segment linearised about states (n_steps + 1, n_nodes) and a heat (n_steps, n_nodes) that keeps them."""
+    """Return a segment linearised about states (n_steps + 1, n_nodes) and a heat (n_steps, n_nodes) that keeps them.
+
+    ``near_K`` are stage states close by, to save iterations.
+    """
     network, forcing = problem.network, segment.forcing
-    steps = one_step(network, values, forcing, states_K[:-1], extra_W)
+    steps = one_step(network, values, forcing, states_K[:-1], extra_W, near_K=near_K)
     pushed = np.einsum("kij,kj->ki", steps.heat_response_K_per_W, extra_W)
     offset = steps.ends_K - pushed - np.einsum("kij,kj->ki", steps.transition, states_K[:-1])
     reference = affine_march(steps.transition, offset, segment.start_prior_K)
@@ -245,17 +268,26 @@ def _smoothing_pass(
 def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> tuple[Nominal, ...]:
     """Linearise every segment at other parameter values about the same temperatures and heat."""
     return tuple(
-        linearise(problem, values, n.segment, np.vstack([n.starts_K, n.steps.ends_K[-1:]]), n.extra_W) for n in nominals
+        linearise(problem, values, n.segment, _states(n), n.extra_W, n.steps.stages_K) for n in nominals
     )
 
 
+def _states(nominal: Nominal) -> FloatArray:
+    """Return the temperatures at every grid point, (n_steps + 1, n_nodes)."""
+    return np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])
+
+
 def gauss_newton_step(
-    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal]
+    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float = np.inf
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free)."""
+    """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free).
+
+    ``leash`` shortens the priors of logarithmic parameters for the early passes, in which the latent heat is still so
+    large that it could take over what conductances do.
+    """
     parameters = problem.network.parameters
     values = parameters.to_values(free)
-    std = parameters.prior_std
+    std = leashed(problem, leash)
     hessian = np.diag(1.0 / std**2)
     gradient = (free - parameters.free) / std**2
     for nominal in nominals:
@@ -271,24 +303,41 @@ def gauss_newton_step(
     return -scale * np.linalg.solve(damped, scale * gradient), hessian
 
 
-def fit_sizes(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
-    """Return the size of the latent heat by maximum likelihood, and that likelihood: a common factor, then each node."""
-    best, value = latent, log_likelihood(problem, latent, nominals)
-    for factor in (0.3, 0.1, 0.03, 0.003):
-        trial = replace(latent, std_W=latent.std_W * factor)
-        found = log_likelihood(problem, trial, nominals)
-        if found < value:
-            break
-        best, value = trial, found
-    for factor in (0.003, 0.05, 4.0, 0.25, 1.8, 0.55):
+def leashed(problem: Problem, leash: float) -> FloatArray:
+    """Return prior deviations with those of logarithmic parameters no longer than a leash."""
+    std = problem.network.parameters.prior_std.copy()
+    std[problem.logarithmic] = np.minimum(std[problem.logarithmic], leash)
+    return std
+
+
+@dataclass
+class SizeSearch:
+    """A pattern search of the latent heat's size, whose steps shrink from pass to pass.
+
+    Attributes
+    ----------
+    log_step : (n_nodes,)
+        Next change to be tried, in ln.
+    """
+
+    log_step: FloatArray
+
+    def improve(self, problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
+        """Return a more likely size of the latent heat on each node, and its log-likelihood."""
+        best, value = latent, log_likelihood(problem, latent, nominals)
         for node in range(problem.n_nodes):
-            std = best.std_W.copy()
-            std[node] *= factor
-            trial = replace(best, std_W=std)
-            found = log_likelihood(problem, trial, nominals)
-            if found > value:
-                best, value = trial, found
-    return best, value
+            moved = False
+            for sign in (-1.0, 1.0):
+                std = best.std_W.copy()
+                std[node] *= np.exp(sign * self.log_step[node])
+                trial = replace(best, std_W=std)
+                found = log_likelihood(problem, trial, nominals)
+                if found > value:
+                    best, value, moved = trial, found, True
+                    break
+            self.log_step[node] *= 1.4 if moved else 0.5
+        self.log_step = np.clip(self.log_step, SMALLEST_LOG_STEP, LARGEST_LOG_STEP)
+        return best, value
 
 
 def first_size(problem: Problem, nominals: Sequence[Nominal]) -> LatentHeat:
@@ -314,7 +363,7 @@ def fit_with_latent_heat(
     free: FloatArray | None = None,
     *,
     near: HeatFit | None = None,
-    n_passes: int = 4,
+    n_passes: int = 12,
 ) -> HeatFit:
     """Fit the free parameters in the presence of latent heat.
 
@@ -327,7 +376,7 @@ def fit_with_latent_heat(
     near
         A fit of the same telemetry from which temperatures and latent heat start.
     n_passes
-        Passes of smoothing, one Gauss-Newton step each, and sizing.
+        Passes at most, of smoothing, a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
 
     Returns
     -------
@@ -336,35 +385,57 @@ def fit_with_latent_heat(
     parameters = problem.network.parameters
     free = parameters.free.copy() if free is None else free.copy()
     values = parameters.to_values(free)
-    nominals: tuple[Nominal, ...]
-    if near is None:
-        nominals = tuple(
-            linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
-            for s in problem.segments
-        )
-        latent = first_size(problem, nominals)
-    else:
+    if near is not None:
         nominals, latent = _carried_over(problem, values, near)
-    value = -np.inf
-    for iteration in range(n_passes):
-        if near is None and iteration < 3:
-            nominals = _smoothing_pass(problem, values, latent, nominals)
-        free, values, nominals = _improve(problem, free, latent, nominals)
-        latent, value = fit_sizes(problem, latent, nominals)
+        sizes = SizeSearch(np.full(problem.n_nodes, 1.5))
+        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes)
+    first = tuple(
+        linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
+        for s in problem.segments
+    )
+    typical = first_size(problem, first)
+    started = []
+    for share in START_SHARES:
+        fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
+        sizes = SizeSearch(np.full(problem.n_nodes, LARGEST_LOG_STEP))
+        for leash in LEASHES:
+            fit = _pass(fit, sizes, leash, smoothing=True)
+        started.append((fit, sizes))
+    fit, sizes = max(started, key=lambda item: item[0].log_posterior)
+    return _settle(fit, sizes, n_passes)
+
+
+def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int) -> HeatFit:
+    """Take passes until the likelihood no longer grows."""
+    for _ in range(n_passes):
+        before = fit.log_likelihood
+        fit = _pass(fit, sizes, np.inf)
+        if fit.log_likelihood - before < SETTLED_NATS and (sizes.log_step < SETTLED_LOG_STEP).all():
+            break
+    return fit
+
+
+def _pass(fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = False) -> HeatFit:
+    """Relinearise about smoothed temperatures where asked, then improve parameters, then the latent heat's size."""
+    problem, nominals = fit.problem, fit.nominals
+    if smoothing:
+        nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
+    free, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
+    latent, value = sizes.improve(problem, fit.latent, nominals)
     return HeatFit(problem, free, latent, nominals, value)
 
 
 def _improve(
-    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal]
-) -> tuple[FloatArray, FloatArray, tuple[Nominal, ...]]:
-    """Take one Gauss-Newton step, halved until the likelihood (with priors) does not fall."""
-    parameters = problem.network.parameters
+    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float
+) -> tuple[FloatArray, tuple[Nominal, ...]]:
+    """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
+    parameters, std = problem.network.parameters, leashed(problem, leash)
 
     def posterior(at: FloatArray, about: Sequence[Nominal]) -> float:
-        return log_likelihood(problem, latent, about) - 0.5 * float((((at - parameters.free) / parameters.prior_std) ** 2).sum())
+        return log_likelihood(problem, latent, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
     before = posterior(free, nominals)
-    step, _ = gauss_newton_step(problem, free, latent, nominals)
+    step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
     logarithmic = problem.logarithmic
     step *= min(1.0, 1.5 / max(np.abs(step[logarithmic]).max(initial=0.0), 1e-12))
     for _ in range(5):
@@ -372,9 +443,9 @@ def _improve(
         values = parameters.to_values(trial)
         about = _relinearised(problem, values, nominals)
         if posterior(trial, about) > before:
-            return trial, values, about
+            return trial, about
         step = 0.35 * step
-    return free, parameters.to_values(free), tuple(nominals)
+    return free, tuple(nominals)
 
 
 def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], LatentHeat]:
@@ -385,7 +456,7 @@ def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[
     own = np.array([n in before.nodes for n in network.nodes])
     fresh = []
     for nominal, segment in zip(near.nominals, problem.segments, strict=True):
-        states = np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])[:, source]
+        states = _states(nominal)[:, source]
         fresh.append(linearise(problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0)))
     std = np.where(own, near.latent.std_W[source], 1e-6)
     return tuple(fresh), LatentHeat(std, near.latent.length_s)

@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.identifiability import words
+from twin_core.calibrate.latent_heat import HeatFit, fit_with_latent_heat
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem
@@ -53,14 +54,11 @@ def sampling_step_s(records: Sequence[Record]) -> float:
     return float(np.median(np.concatenate([np.diff(r.time_s) for r in records if r.time_s.size > 1] or [np.ones(1)])))
 
 
-def fit_network(
-    spec: TwinSpec,
-    records: Sequence[Record],
-    effects: Sequence[Effect] = (),
-    *,
-    progress: Progress = no_progress,
-) -> Calibration:
-    """Calibrate a declared network, with effects if any, against telemetry.
+def prepare(spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect] = ()) -> tuple[Problem, float]:
+    """Return the fitting problem of a declared network, and its longest time step.
+
+    Levels of tables are read from the telemetry, parameters that nobody guessed start from integrated heat balances, and
+    the time step is halved until halving changes no reading by more than a tenth of its noise.
 
     Parameters
     ----------
@@ -71,68 +69,95 @@ def fit_network(
     effects
         Terms beyond the declaration, at their starting values.
 
-    Returns
-    -------
-    Calibration
-
     Raises
     ------
     TelemetryError
         If telemetry lacks a channel that the model needs, or has too few samples.
-    ModelError
-        If the heat balance has no solution at the guesses.
     """
-    progress(0.0, "reading noise and levels")
     noise = sensor_noise_K(spec, list(records))
     network = build_network(spec, effects, table_knots=table_levels(spec, records))
     step = 1.5 * sampling_step_s(records)
     problem = build_problem(network, records, noise, step)
     problem = problem.with_network(network.with_parameters(balance_start(problem)))
-    progress(0.05, "calibrating")
-    optimum = _best_start(problem, progress)
-    for halving in range(MAX_HALVINGS):
+    for _ in range(MAX_HALVINGS):
         finer = build_problem(problem.network, records, noise, step / 2.0)
-        if _step_error(problem, finer, optimum) < STEP_ERROR_SHARE:
+        if _step_error(problem, finer) < STEP_ERROR_SHARE:
             break
         step, problem = step / 2.0, finer
-        progress(0.7 + 0.1 * halving, "refining the time step")
-        optimum = minimise(problem, optimum.unknowns)
+    return problem, step
+
+
+def fit_network(
+    spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect] = (), *, progress: Progress = no_progress
+) -> tuple[HeatFit, Calibration]:
+    """Calibrate a declared network, with effects if any, against telemetry.
+
+    Parameters
+    ----------
+    spec, records, effects
+        As in :func:`prepare`.
+    progress
+        Called with the fraction done.
+
+    Returns
+    -------
+    HeatFit, Calibration
+        The fit in the presence of latent heat, and the best open-loop trajectories found from it and from the guesses.
+
+    Raises
+    ------
+    TelemetryError
+        If the telemetry cannot be used.
+    ModelError
+        If the heat balance has no solution at any start.
+    """
+    progress(0.0, "reading noise and levels")
+    problem, step = prepare(spec, records, effects)
+    progress(0.1, "fitting in the presence of latent heat")
+    fit = fit_with_latent_heat(problem)
+    progress(0.4, "fitting open-loop trajectories")
+    optimum = _best_start(fit, progress)
     if optimum.status == "no_solution":
         raise ModelError(f"calibration failed: {ADVICE[optimum.status]}")
     progress(0.95, "weighing what is left")
-    return Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
+    return fit, Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
 
 
-def _step_error(problem: Problem, finer: Problem, optimum: Optimum) -> float:
-    """Return the largest change of a reading, in units of its noise, when the time step is halved."""
-    values = problem.values(optimum.unknowns)
+def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
+    """Return the open-loop calibration that starts from a fit in the presence of latent heat.
+
+    ``near`` are optima of the same problem found otherwise: the best of all is kept.
+    """
+    best = min([minimise(fit.problem, fit.unknowns()), *near], key=lambda o: o.fit.cost)
+    return Calibration(fit.problem, best, fit_whitener(fit.problem, fit.problem.residuals(best.fit)), max_step_s)
+
+
+def _step_error(problem: Problem, finer: Problem) -> float:
+    """Return the largest change of a reading at the start values, in units of its noise, when the step is halved."""
+    values = problem.network.parameters.values
     worst = 0.0
-    for i, (segment, path) in enumerate(zip(finer.segments, optimum.fit.trajectories, strict=True)):
-        start = optimum.unknowns[problem.start_columns(i)]
-        fine = rollout(problem.network, values, start, segment.forcing)
-        if not (fine.converged and path.converged):
+    for coarse, fine in zip(problem.segments, finer.segments, strict=True):
+        paths = [rollout(problem.network, values, s.start_prior_K, s.forcing) for s in (coarse, fine)]
+        if not all(path.converged for path in paths):
             continue
-        coarse = path.at_samples(problem.segments[i].forcing.sample_step)
-        change = np.abs(coarse - fine.at_samples(segment.forcing.sample_step))[:, problem.network.sensor_node]
+        read = [p.at_samples(s.forcing.sample_step) for p, s in zip(paths, (coarse, fine), strict=True)]
+        change = np.abs(read[0] - read[1])[:, problem.network.sensor_node]
         worst = max(worst, float((change / problem.noise_K).max()))
     return worst
 
 
-def _best_start(problem: Problem, progress: Progress) -> Optimum:
-    """Return the best optimum from the declared guesses, and from scattered ones where guesses are missing."""
-    best = minimise(problem)
-    parameters, unknowns = problem.network.parameters, problem.start()
+def _best_start(fit: HeatFit, progress: Progress) -> Optimum:
+    """Return the best optimum from the heat fit, from the declared guesses, and where those are missing from others."""
+    problem = fit.problem
+    best = min(minimise(problem, fit.unknowns()), minimise(problem), key=lambda o: o.fit.cost)
+    parameters, unknowns = problem.network.parameters, fit.unknowns()
     guessed = np.array([parameters.parameters[i].guessed for i in parameters.free_index], dtype=np.bool_)
-    if not guessed.any():
-        return best
     generator = np.random.default_rng(0)
-    for trial in range(1, N_STARTS):
-        progress(0.1 + 0.15 * trial, "calibrating from other starting points")
+    for trial in range(1, N_STARTS if guessed.any() else 1):
+        progress(0.4 + 0.15 * trial, "fitting from other starting points")
         scattered = unknowns.copy()
         scattered[: problem.n_free][guessed] += generator.normal(0.0, 1.0, int(guessed.sum()))
-        other = minimise(problem, scattered, max_iterations=40)
-        if other.fit.cost < best.fit.cost:
-            best = other
+        best = min(best, minimise(problem, scattered, max_iterations=40), key=lambda o: o.fit.cost)
     return best
 
 

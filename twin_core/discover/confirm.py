@@ -9,10 +9,10 @@ from scipy.stats import chi2
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.latent_heat import HeatFit, fit_with_latent_heat
-from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
-from twin_core.calibrate.residual_noise import fit_whitener, stacked_jacobian
-from twin_core.calibrate.second_order import Calibration
+from twin_core.calibrate.residual_noise import stacked_jacobian
+from twin_core.calibrate.second_order import Calibration, from_heat_fit
 from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
 
@@ -32,22 +32,19 @@ class Trial:
         Parameters, latent heat and likelihood.
     max_step_s
         Longest time step.
+    near
+        Open-loop optima of the same problem found otherwise.
     """
 
     effects: tuple[Effect, ...]
     fit: HeatFit
     max_step_s: float
+    near: tuple[Optimum, ...] = ()
 
     @cached_property
     def calibration(self) -> Calibration:
-        """The same model calibrated on open-loop trajectories, started from the fit."""
-        problem = self.fit.problem
-        unknowns = problem.start()
-        unknowns[: problem.n_free] = self.fit.free
-        for i, nominal in enumerate(self.fit.nominals):
-            unknowns[problem.start_columns(i)] = nominal.starts_K[0]
-        optimum = minimise(problem, unknowns)
-        return Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), self.max_step_s)
+        """The same model calibrated on open-loop trajectories."""
+        return from_heat_fit(self.fit, self.max_step_s, near=self.near)
 
     @cached_property
     def block_errors(self) -> FloatArray:
@@ -90,7 +87,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     return errors
 
 
-def try_effects(base: Trial, effects: Sequence[Effect]) -> Trial:
+def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) -> Trial:
     """Return the trial of a set of effects, fitted with all parameters from a trial close by.
 
     Parameters
@@ -99,6 +96,8 @@ def try_effects(base: Trial, effects: Sequence[Effect]) -> Trial:
         Where to start from: the same telemetry, with or without some of the effects.
     effects
         All effects of the new trial, at their starting values.
+    n_passes
+        Passes of the fit at most: few to rank, many to settle.
     """
     problem = extended(base.fit.problem, effects)
     names = base.fit.problem.network.parameters.free_names
@@ -110,7 +109,7 @@ def try_effects(base: Trial, effects: Sequence[Effect]) -> Trial:
             for name, value in zip(problem.network.parameters.free_names, problem.network.parameters.free, strict=True)
         ]
     )
-    fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=3)
+    fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=n_passes)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s)
 
 
@@ -158,7 +157,7 @@ class Validation:
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return what the likelihood says for the rich trial, chosen among ``n_tried`` candidates."""
     extra = max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)
-    gain = rich.fit.log_likelihood - simple.fit.log_likelihood
+    gain = rich.fit.log_posterior - simple.fit.log_posterior
     penalty = 0.5 * extra * np.log(max(rich.n_samples, 2)) + np.log(max(n_tried, 1))
     p_value = min(1.0, max(n_tried, 1) * float(chi2.sf(2.0 * max(gain, 0.0), extra)))
     return Evidence(float(gain - penalty), p_value)

@@ -4,12 +4,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import Calibration, fit_network, to_model
+from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.plots import build_plots
-from twin_core.discover.report import build_report, misfit_share
+from twin_core.discover.report import build_report
 from twin_core.discover.search import Search, search, threshold
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
@@ -71,10 +74,11 @@ def close_loop(
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
     begun = time.perf_counter()
     train, held = _split(records, holdout, holdout_records, burn_in_s)
-    calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
+    fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
     found = search(
-        calibration, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m)
+        base, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m)
     )
     after = to_model(found.trial.calibration, found.trial.effects) if found.findings else before
     progress(0.88, "predicting the hold-out")
@@ -105,7 +109,12 @@ def verdict_of(found: Search, false_alarm_rate: float) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    noise = found.base.calibration.problem.noise_K
-    left = misfit_share(found.base.calibration.whitener, noise)
-    hinted = any(c.log_bayes_factor > threshold(false_alarm_rate) for _, c in found.rejected)
-    return "unexplained" if left > UNEXPLAINED_SHARE and hinted else "no_effect_supported"
+    needed = threshold(false_alarm_rate)
+    hinted = any(judged.evidence.log_bayes_factor > needed for judged in found.rejected)
+    return "unexplained" if hinted and misfit_share(found.base.calibration) > UNEXPLAINED_SHARE else "no_effect_supported"
+
+
+def misfit_share(calibration: Calibration) -> float:
+    """Return the rms over sensors of misfit over noise: how much a model leaves beyond the sensors' own noise."""
+    models, noise = calibration.whitener.models, calibration.problem.noise_K
+    return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))

@@ -5,18 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from twin_core._typing import FloatArray, Json
-from twin_core.calibrate.residual_noise import Whitener
+from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import acceptance
 from twin_core.calibrate.statistics import residual_whiteness, score
-from twin_core.discover.confirm import Comparison
+from twin_core.discover.search import Finding, Judged, Search
 from twin_core.discover.holdout import HeldOut, Prediction
-from twin_core.discover.search import Finding, Search
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
-
-MAX_POINTS = 2000
 
 
 def where_json(effect: Effect) -> Json:
@@ -43,14 +39,12 @@ def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
     return rows
 
 
-def evidence_json(comparison: Comparison) -> Json:
+def evidence_json(judged: Judged) -> Json:
     """Return what speaks for an effect."""
-    return {
-        "log_bayes_factor": comparison.log_bayes_factor,
-        "p_value": comparison.p_value,
-        "validation_ratio": comparison.validation_ratio,
-        "blocks_better": comparison.blocks_better,
-    }
+    row: Json = {"log_bayes_factor": judged.evidence.log_bayes_factor, "p_value": judged.evidence.p_value}
+    if judged.validation is not None:
+        row |= {"validation_ratio": judged.validation.ratio, "blocks_better": judged.validation.blocks_better}
+    return row
 
 
 def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[Json]:
@@ -58,7 +52,7 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
     stds = {p["name"]: p["std"] for p in model.summary["parameters"]}
     fitted = {effect.place: effect for effect in model.effects}
     rows = []
-    for finding in sorted(findings, key=lambda f: -f.comparison.log_bayes_factor):
+    for finding in sorted(findings, key=lambda f: -f.judged.evidence.log_bayes_factor):
         for effect in finding.effects:
             own = fitted[effect.place]
             rows.append(
@@ -67,16 +61,16 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
                     "where": where_json(own),
                     "parameters": parameters_json(own, stds),
                     "equation": own.equation,
-                    "evidence": evidence_json(finding.comparison),
+                    "evidence": evidence_json(finding.judged),
                     "judged_with": [e.label for e in finding.effects if e is not effect],
                     "alternatives": [
                         {
                             "effect": other.name,
                             "where": where_json(other),
-                            "log_bayes_factor": comparison.log_bayes_factor,
+                            "log_bayes_factor": option.evidence.log_bayes_factor,
                         }
-                        for option, comparison in finding.alternatives
-                        for other in option
+                        for option in finding.alternatives
+                        for other in option.effects
                     ],
                 }
             )
@@ -97,11 +91,6 @@ def span_json(records: Sequence[Record], counted: int) -> Json:
 def noise_floor_K(model: CalibratedModel) -> float:
     """Return the rms noise of the sensors: no model can predict readings better."""
     return float(np.sqrt(np.mean(model.noise_vector_K() ** 2)))
-
-
-def misfit_share(whitener: Whitener, noise_K: FloatArray) -> float:
-    """Return the rms over sensors of misfit over noise: how much the model leaves beyond the sensors' own noise."""
-    return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(whitener.models, noise_K, strict=True)])))
 
 
 def build_report(
@@ -129,7 +118,7 @@ def build_report(
     """
     sensors = before.spec.sensors
     scores = [held_out_scores(sensors, p) for p in predictions]
-    train = [segment.record for segment in search.base.calibration.problem.segments]
+    train = [segment.record for segment in search.base.fit.problem.segments]
     residuals = [[p.measured_K - p.predicted_K for p in ps] for ps in predictions]
     scored = [h.scored for h in held]
     counted = int(sum(np.isfinite(p.measured_K).any(axis=1).sum() for p in predictions[0]))
@@ -152,8 +141,8 @@ def build_report(
         },
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
         "not_supported": [
-            {"effects": [e.label for e in option], "evidence": evidence_json(comparison)}
-            for option, comparison in sorted(search.rejected, key=lambda item: -item[1].log_bayes_factor)[:8]
+            {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged)}
+            for judged in sorted(search.rejected, key=lambda j: -j.evidence.log_bayes_factor)[:8]
         ],
         "words": after.summary["words"],
         "notices": before.summary["notices"],

@@ -1,7 +1,7 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,9 +12,13 @@ from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
 MAX_FINDINGS = 4
-N_REFITS = 10
+N_REFITS = 12
+LATENT_SHARES = (1.0, 0.1, 0.01)
+"""Sizes of the latent heat at which candidates are screened, as shares of the fitted one."""
+
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
+N_SETTLED = 4
 N_VALIDATED = 3
 ALTERNATIVE_NATS = 3.0
 VALIDATION_GAIN = 0.97
@@ -59,8 +63,15 @@ def threshold(false_alarm_rate: float) -> float:
     return float(np.log(1.0 / false_alarm_rate))
 
 
-def screened(trial: Trial, *, fallback: bool) -> Screening:
-    """Screen every candidate effect at every place and setting that the trial does not have yet."""
+def screened(trial: Trial, *, fallback: bool) -> list[Screening]:
+    """Screen every candidate effect at every place and setting that the trial does not have yet.
+
+    Returns
+    -------
+    list of Screening
+        One per assumed size of the latent heat: as fitted, where it explains everything a little, and smaller, as it
+        would be if the right effect were in place.
+    """
     survey = survey_of(trial.fit)
     taken = {effect.place for effect in trial.effects}
     effects = [
@@ -71,7 +82,19 @@ def screened(trial: Trial, *, fallback: bool) -> Screening:
         for effect in kind.starts(where, survey)
         if effect.place not in taken
     ]
-    return screen(trial.fit, survey, effects)
+    latent = trial.fit.latent
+    sized = [replace(trial.fit, latent=replace(latent, std_W=share * latent.std_W)) for share in LATENT_SHARES]
+    return [screen(fit, survey, effects) for fit in sized]
+
+
+def shortlist(rankings: Sequence[Sequence[Probe]], needed: float) -> list[Effect]:
+    """Return the effects worth a refit: the best of every ranking in turn, each place once."""
+    chosen: dict[object, Effect] = {}
+    for rank in range(N_REFITS):
+        for ranked in rankings:
+            if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < N_REFITS:
+                chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
+    return list(chosen.values())
 
 
 def best_of_each_place(probes: Sequence[Probe], n_samples: int) -> list[Probe]:
@@ -117,33 +140,38 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported."""
-    screening = screened(state.trial, fallback=fallback)
-    ranked = best_of_each_place(screening.probes, state.trial.n_samples)
-    singles = [(p.effect,) for p in ranked[:N_REFITS] if p.gain > 1.0]
-    if _accept(state, singles, len(ranked), needed):
+    screenings = screened(state.trial, fallback=fallback)
+    if not any(probe.gain > needed for probe in screenings[0].probes):
+        return False
+    rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
+    n_tried = max(len(ranked) for ranked in rankings)
+    singles = [(effect,) for effect in shortlist(rankings, needed)]
+    if _accept(state, singles, n_tried, needed):
         return True
-    pairs = [] if fallback else _best_pairs(ranked, screening)
-    return _accept(state, pairs, max(len(ranked) ** 2 // 2, 1), needed)
+    pairs = [] if fallback else _best_pairs(rankings[0], screenings[0], needed)
+    return _accept(state, pairs, max(n_tried**2 // 2, 1), needed)
 
 
-def _best_pairs(ranked: Sequence[Probe], screening: Screening) -> list[tuple[Effect, ...]]:
-    """Return the pairs of probes that could add most together."""
+def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) -> list[tuple[Effect, ...]]:
+    """Return the pairs of probes that could add most together: more than either alone, and enough to be supported."""
     some = ranked[:N_PAIR_PROBES]
-    scored = [
-        (joint_gain(a, b, screening.residual), (a.effect, b.effect)) for i, a in enumerate(some) for b in some[i + 1 :]
-    ]
+    scored = []
+    for i, a in enumerate(some):
+        for b in some[i + 1 :]:
+            gain = joint_gain(a, b, screening.residual)
+            if gain > max(a.gain, b.gain) + needed:
+                scored.append((gain, (a.effect, b.effect)))
     scored.sort(key=lambda item: -item[0])
     return [pair for _, pair in scored[:N_PAIR_REFITS]]
 
 
 def _accept(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int, needed: float) -> bool:
     """Refit every option, keep the best that passes evidence and validation; False if none does."""
-    judged = []
-    for option in options:
-        trial = try_effects(state.trial, (*state.trial.effects, *option))
-        found = trial.effects[len(state.trial.effects) :]
-        judged.append(Judged(found, weigh(state.trial, trial, n_tried), trial))
-    judged.sort(key=lambda j: -j.evidence.log_bayes_factor)
+    judged = [_judge(state, state.trial, option, n_tried, n_passes=3) for option in options]
+    judged.sort(key=_worth)
+    near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > judged[0].evidence.log_bayes_factor - 40.0]
+    settled = [_judge(state, j.trial, j.effects, n_tried, n_passes=15) for j in near]
+    judged = sorted([*settled, *judged[len(near) :]], key=_worth)
     for best in judged[:N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             break
@@ -157,6 +185,17 @@ def _accept(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int, 
         state.rejected.append(Judged(best.effects, best.evidence, best.trial, validation))
     state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
     return False
+
+
+def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:
+    """Fit an option on top of the state's effects, started from a trial close by."""
+    trial = try_effects(start, (*state.trial.effects, *option), n_passes=n_passes)
+    found = trial.effects[len(state.trial.effects) :]
+    return Judged(found, weigh(state.trial, trial, n_tried), trial)
+
+
+def _worth(judged: Judged) -> float:
+    return -judged.evidence.log_bayes_factor
 
 
 def _is_close(other: Judged, best: Judged) -> bool:

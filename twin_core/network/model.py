@@ -20,7 +20,7 @@ from twin_core.network.terms import (
     TableLoad,
     Term,
 )
-from twin_core.parameters.parameter import Parameter, positive, real
+from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD, Parameter, positive, real
 from twin_core.parameters.vector import ParameterSet
 
 
@@ -135,7 +135,7 @@ def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -
     known = quantity is not None and quantity.value is not None
     declared = quantity is not None and quantity.guess is not None
     bounds = None if quantity is None else quantity.bounds
-    prior = 3.0 if declared else 6.0
+    prior = GUESS_LOG_STD if declared else NO_GUESS_LOG_STD
     return positive(name, unit, value, bounds=bounds, prior_std=prior, frozen=known, guessed=not (known or declared))
 
 

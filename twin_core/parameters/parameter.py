@@ -45,8 +45,11 @@ class Parameter:
         return replace(self, value=value)
 
 
-WEAK_LOG_STD = 3.0
-"""Prior of a guess in ln: a factor of 20 either way is one standard deviation, so data always win."""
+GUESS_LOG_STD = 1.0
+"""Prior of a declared guess in ln: a factor e either way is one standard deviation, so that data win where they speak."""
+
+NO_GUESS_LOG_STD = 6.0
+"""Prior where nobody guessed: five orders of magnitude either way are two standard deviations."""
 
 
 def positive(
@@ -55,7 +58,7 @@ def positive(
     value: float,
     *,
     bounds: tuple[float, float] | None = None,
-    prior_std: float | None = WEAK_LOG_STD,
+    prior_std: float | None = GUESS_LOG_STD,
     frozen: bool = False,
     guessed: bool = False,
 ) -> Parameter:
