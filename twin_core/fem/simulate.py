@@ -18,6 +18,9 @@ from twin_core.fem.signals import Path
 from twin_core.fem.stepping import SCHEMES, Drive
 from twin_core.telemetry import Record
 
+_LEAST_J = 1e-3
+"""Below this nothing moved: the imbalance of an isolated field at rest is rounding over this, not over nothing."""
+
 _PER_SCENARIO = {"scenario", "seed", "forcings", "hidden", "time"}
 """Fields in which scenarios that share a field may differ (of time: only the start and the sampling)."""
 
@@ -147,8 +150,8 @@ def _run(
         drive = Drive(inputs_W[n], boundary_K[n], hidden.heat_W if hidden.any else None)
         after = scheme.step(float(time_s), temperature_K, drive)
         stored_J = weight @ (after - temperature_K)
-        moved_J = np.abs(field.capacity_matrix @ (after - temperature_K)).sum(axis=0) + 1e-300
-        history.imbalance[n + 1] = np.abs(stored_J - scheme.heat_in_J) / moved_J
+        moved_J = np.maximum(scheme.heat_moved_J, np.abs(field.capacity_matrix @ (after - temperature_K)).sum(axis=0))
+        history.imbalance[n + 1] = np.abs(stored_J - scheme.heat_in_J) / np.maximum(moved_J, _LEAST_J)
         temperature_K = after
         history.readings_K[n + 1], history.regions_K[n + 1] = field.readings @ after, means @ after
         history.hidden_W[n + 1] = hidden.by_region_W()

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+
 from twin_core.errors import SpecError
 from twin_core.fem.demo import DEMO_EFFECTS, demo_scenario
 from twin_core.fem.scenario import Scenario, load_scenario

@@ -1,10 +1,12 @@
 """Time schemes and assembly against manufactured solutions, energy balance and closed forms."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from skfem import Basis, ElementQuad1, FacetBasis, LinearForm, MeshQuad
+
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.fem.assembly import Assembler, assemble
 from twin_core.fem.field import Field
@@ -90,7 +92,7 @@ def test_second_order_in_space() -> None:
 def test_measured_order_in_time(scheme: str, order: float) -> None:
     """On one mesh, differences between three step sizes shrink by 2^order; the space part cancels in them."""
     field_gap = [run_to_K(scheme, step) for step in (300.0, 150.0, 75.0)]
-    first, second = (np.abs(a - b).max() for a, b in zip(field_gap, field_gap[1:], strict=False))
+    first, second = (np.abs(a - b).max() for a, b in itertools.pairwise(field_gap))
     assert np.log2(first / second) == pytest.approx(order, abs=0.25)
 
 
