@@ -84,20 +84,29 @@ def forecast(
     _check(horizon_s, step, quantiles)
     network = model.network()
     values = network.parameters.values
-    present = assimilate(model, record, state)
+    present_K, covariance_K2 = _present(model, record, state)
     future = future_record(model.spec, record, horizon_s, step, plan)
     forcing = build_forcing(network, future, model.max_step_s)
-    path = rollout(network, values, present.mean_K, forcing)
+    path = rollout(network, values, present_K, forcing)
     if not path.converged:
         raise ModelError("the heat balance has no solution over the horizon: check the planned inputs")
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node].copy()
     for term in network.readings:
         part = term.evaluate(future.time_s, values[network.term_index(term)])
         read[:, part.sensor] += part.offset_K
-    std = np.sqrt(_variance(model, network, forcing, path, present.covariance_K2, future.time_s))[1:]
+    std = np.sqrt(_variance(model, network, forcing, path, covariance_K2, future.time_s))[1:]
     mean = read[1:]
     bands = {q: mean + norm.ppf(q) * std for q in quantiles}
     return Forecast(future.time_s[1:], model.spec.sensors, mean, bands)
+
+
+def _present(model: CalibratedModel, record: Record, state: Json | None) -> tuple[FloatArray, FloatArray]:
+    """Return mean, (n_nodes,), and covariance of the state at the end of the record."""
+    if state is not None and record.time_s.size == 1:  # the state is of this very sample: nothing is left to filter
+        mean = np.array(state["mean_K"], dtype=np.float64)
+        return mean, np.array(state["covariance_K2"], dtype=np.float64).reshape(mean.size, mean.size)
+    done = assimilate(model, record, state)
+    return done.mean_K, done.covariance_K2
 
 
 def _check(horizon_s: float, step_s: float, quantiles: Sequence[float]) -> None:
