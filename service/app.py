@@ -1,6 +1,7 @@
 """The application: layers, routes and what lives as long as it runs."""
 
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 
 from fastapi import FastAPI
@@ -9,17 +10,61 @@ from service import problems
 from service.access import Gate
 from service.bodies import Bodies
 from service.deps import Service
+from service.jobs.runner import Jobs
+from service.live.live import Live
 from service.metrics import Metrics, Observe
 from service.registry import Registry
-from service.routes import health, telemetry, twins
+from service.routes import health, jobs, live, models, streams, telemetry, twins
 from service.settings import Settings, read_settings
+from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
+from service.streams import Hub
+from service.workbench import CoreWorkbench, Workbench
 
-ROUTERS = (health.router, twins.router, telemetry.router)
+log = logging.getLogger("service")
+
+ROUTERS = (
+    health.router,
+    twins.router,
+    telemetry.router,
+    jobs.calibrations,
+    jobs.diagnoses,
+    models.router,
+    live.router,
+    streams.router,
+)
 
 
-def create_app(settings: Settings | None = None, database: Database | None = None) -> FastAPI:
+@contextlib.asynccontextmanager
+async def _running(
+    settings: Settings, database: Database, metrics: Metrics, workbench: type[Workbench]
+) -> AsyncIterator[Service]:
+    """Start everything that works in the background, and stop it in the opposite order."""
+    interrupted = await database.write(job_table.fail_interrupted)
+    if interrupted:
+        log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
+    hub = Hub(database, metrics, settings.stream_buffer)
+    live_state = Live(database, hub, workbench)
+    runner = Jobs(
+        database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
+    )
+    service = Service(settings, database, Registry(()), metrics, hub, live_state, runner)
+    for twin in await database.read(twin_table.select):
+        service.add_twin(twin)
+    try:
+        yield service
+    finally:
+        hub.close()
+        await runner.close()
+        await live_state.close()
+
+
+def create_app(
+    settings: Settings | None = None,
+    database: Database | None = None,
+    workbench: type[Workbench] = CoreWorkbench,
+) -> FastAPI:
     """Return the application; the store is opened when it starts, unless it is handed over open, and closed at the end.
 
     Raises
@@ -34,9 +79,9 @@ def create_app(settings: Settings | None = None, database: Database | None = Non
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = database or Database(settings.database_path)
         try:
-            registry = Registry(await store.read(twin_table.select))
-            app.state.service = Service(settings, store, registry, metrics)
-            yield
+            async with _running(settings, store, metrics, workbench) as service:
+                app.state.service = service
+                yield
         finally:
             store.close()
 

@@ -83,9 +83,9 @@ def models(name: str) -> Call[schemas.ModelList]:
     return Call("GET", f"/v1/twins/{name}/models", schemas.ModelList)
 
 
-def model(name: str, version: int) -> Call[schemas.ModelInfo]:
+def model(name: str, version: int) -> Call[schemas.ModelDetail]:
     """Inspect one version with the model itself."""
-    return Call("GET", f"/v1/twins/{name}/models/{version}", schemas.ModelInfo)
+    return Call("GET", f"/v1/twins/{name}/models/{version}", schemas.ModelDetail)
 
 
 def activate(name: str, version: int) -> Call[schemas.ModelInfo]:

@@ -212,7 +212,7 @@ class TwinClient:
         """Return every version of the model."""
         return self.send(calls.models(name)).models
 
-    def model(self, name: str, version: int) -> schemas.ModelInfo:
+    def model(self, name: str, version: int) -> schemas.ModelDetail:
         """Return one version, with the model document itself in ``model``."""
         return self.send(calls.model(name, version))
 

@@ -7,11 +7,16 @@ from fastapi import Depends, Path
 from starlette.requests import HTTPConnection
 
 from service.access import Role
+from service.jobs.runner import Jobs
+from service.live.live import Live
 from service.metrics import Metrics
 from service.problems import Problem
 from service.registry import Entry, Registry
 from service.settings import Settings
+from service.store import twins
 from service.store.database import Database
+from service.store.twins import Twin
+from service.streams import Hub
 
 
 @dataclass
@@ -22,6 +27,25 @@ class Service:
     database: Database
     registry: Registry
     metrics: Metrics
+    hub: Hub
+    live: Live
+    jobs: Jobs
+
+    def add_twin(self, twin: Twin) -> Entry:
+        """Let a stored twin take part in everything."""
+        entry = self.registry.add(twin)
+        self.hub.open(entry.key, twin.seq)
+        if self.settings.assimilate:
+            self.live.add(entry)
+        return entry
+
+    async def remove_twin(self, twin: Entry) -> None:
+        """Stop whatever concerns a twin, then delete it."""
+        self.registry.remove(twin.name)
+        await self.jobs.cancel_twin(twin)
+        await self.live.remove(twin)
+        await self.database.write(twins.delete, twin.name)
+        self.hub.close(twin.key)
 
 
 def running_service(connection: HTTPConnection) -> Service:

@@ -25,6 +25,11 @@ class Entry:
         return load_spec(self.specification)
 
     @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        """Every temperature channel that reads a node, in the order of the nodes."""
+        return self.spec.sensors
+
+    @cached_property
     def units(self) -> dict[str, str | None]:
         """Channel -> unit."""
         return {name: channel.get("unit") for name, channel in self.specification["channels"].items()}

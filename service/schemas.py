@@ -104,7 +104,7 @@ class CalibrationRequest(_Request):
     method: str = "second-order"
     start: Time | None = None
     stop: Time | None = None
-    activate: bool | None = Field(None, description="true: always, false: never, absent: if it is the better one")
+    activate: bool | None = Field(default=None, description="true: always, false: never, absent: if it is the better")
 
 
 class DiagnosisRequest(_Request):
@@ -155,10 +155,25 @@ class ModelInfo(_Answer):
     effects: list[dict[str, Any]]
 
 
+class ModelDetail(ModelInfo):
+    """One version with the model itself, as the command line reads it."""
+
+    model: dict[str, Any]
+
+
+class Activation(_Answer):
+    """When and why a version became the active one."""
+
+    version: int
+    time: Instant
+    reason: str
+
+
 class ModelList(_Answer):
-    """Every version of a twin's model, the oldest first."""
+    """Every version of a twin's model, the oldest first, and the log of activations, the newest first."""
 
     models: list[ModelInfo]
+    activations: list[Activation]
 
 
 class ForecastRequest(_Request):

@@ -36,8 +36,9 @@ def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> 
     listener = _listen(settings)
     database = Database(settings.database_path)
     host, port = listener.getsockname()[:2]
+    app = create_app(settings, database)
     config = uvicorn.Config(
-        create_app(settings, database),
+        app,
         log_config=None,
         access_log=False,
         ws="websockets-sansio",
@@ -46,7 +47,9 @@ def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> 
         timeout_graceful_shutdown=SHUTDOWN_S,
         server_header=False,
     )
-    server = _Server(config, on_ready, f"http://{f'[{host}]' if ':' in host else host}:{port}")
+    server = _Server(
+        config, on_ready, lambda: app.state.service.hub.close(), f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    )
     with contextlib.suppress(KeyboardInterrupt), listener:  # raised again once everything is closed in good order
         server.run(sockets=[listener])
 
@@ -66,9 +69,20 @@ def _listen(settings: Settings) -> socket.socket:
 class _Server(uvicorn.Server):
     """A server that tells when it is ready."""
 
-    def __init__(self, config: uvicorn.Config, on_ready: Callable[[str], None] | None, url: str) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        on_ready: Callable[[str], None] | None,
+        end_streams: Callable[[], None],
+        url: str,
+    ) -> None:
         super().__init__(config)
-        self._on_ready, self._url = on_ready, url
+        self._on_ready, self._end_streams, self._url = on_ready, end_streams, url
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End the streams first: they would hold the shutdown up until its deadline."""
+        self._end_streams()
+        await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)

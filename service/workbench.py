@@ -141,6 +141,11 @@ class Workbench(Protocol):
         """Look ahead."""
 
 
+def work(workbench: type[Workbench], function: str, task: Any, progress: Progress) -> Any:
+    """Do one task; worker processes find this function by its name."""
+    return getattr(workbench(), function)(task, progress)
+
+
 class CoreWorkbench:
     """The workbench of ``twin_core``."""
 
@@ -169,9 +174,8 @@ class CoreWorkbench:
 
     def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
         """Close the loop."""
-        from twin_core.discover.html import render
-
         from twin_core.discover import close_loop
+        from twin_core.discover.html import render
 
         spec = _spec(task.specification)
         loop = close_loop(
@@ -289,8 +293,5 @@ def _outcome(model: Any, validation: Json, rival_rmse_K: float | None) -> Outcom
     document = model.to_json()
     summary = dict(model.summary)
     train = summary.pop("train", {})
-    effects = [
-        effect if "parameters" in effect else {**effect, "parameters": {}} for effect in document.get("effects", [])
-    ]
     extra = {"parameters": summary.get("parameters", []), "notices": summary.get("notices", []), "fit": summary}
-    return Outcome(document, train, validation, effects, rival_rmse_K, extra=extra)
+    return Outcome(document, train, validation, document["effects"], rival_rmse_K, extra=extra)

@@ -132,6 +132,12 @@ def _end(process: Any) -> None:
     process.close()
 
 
+def prepare_worker() -> None:
+    """Make a worker process live exactly as long as the service wants it to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the parent decides
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
 def _end_with_parent() -> None:
     """End this process when the service dies, however it dies: nobody would want the result."""
     parent = multiprocessing.parent_process()
@@ -142,9 +148,8 @@ def _end_with_parent() -> None:
 
 def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     """Do the task: the whole life of a worker process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the parent decides
+    prepare_worker()
     os.nice(10)  # ingest and the live state go first
-    Thread(target=_end_with_parent, daemon=True).start()
     module, _, qualified = name.partition(":")
     function: Any = importlib.import_module(module)
     for part in qualified.split("."):

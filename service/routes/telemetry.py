@@ -1,6 +1,8 @@
 """Telemetry: take samples in, give the archive out."""
 
 import asyncio
+import sqlite3
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from service.deps import NamedTwin, Running, Service, ingests, reads
 from service.downsample import extremes
 from service.frames import Batch, parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_parameter
+from service.messages import SampleStretch
 from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Archive, Columns, IngestReport
@@ -43,11 +46,21 @@ async def ingest(request: Request, service: Running, twin: NamedTwin) -> Respons
     else:
         batch = parse(body, twin.channels)
     try:
-        receipt = await service.database.write(samples.append, twin.key, batch)
+        receipt = await service.hub.write(twin.key, _store, twin, batch)
     except LookupError:
         raise Problem(404, f"no twin '{twin.name}' is registered") from None
+    if receipt.stored.any():
+        service.live.arrived(twin, batch.time_us[receipt.stored])
     _count(service, twin, batch, receipt)
     return Response(orjson.dumps(_report(receipt, batch)), media_type="application/json")
+
+
+def _store(connection: sqlite3.Connection, twin: Entry, batch: Batch) -> tuple[Receipt, Sequence[SampleStretch]]:
+    """Store a batch and say what the stream hears of it."""
+    receipt = samples.append(connection, twin.key, batch)
+    kept = receipt.stored
+    seqs = receipt.first_seq + np.arange(int(kept.sum()))
+    return receipt, [SampleStretch(twin.channels, seqs, batch.time_us[kept], batch.values[:, kept])]
 
 
 def _parser(content_type: str) -> Any:

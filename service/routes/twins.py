@@ -40,7 +40,7 @@ async def register(service: Running, response: Response, body: Annotated[dict[st
     """Register a specification (201); the identical one again answers 200, another one under its id 409."""
     spec = load_spec(body)
     twin, is_new = await service.database.write(twins.register, spec.twin, dump_spec(spec))
-    service.registry.add(twin)
+    service.add_twin(twin)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
     return _detail(twin)
@@ -61,5 +61,4 @@ async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
 @router.delete("/{twin}", status_code=204, dependencies=[operates])
 async def delete(service: Running, twin: NamedTwin) -> None:
     """Delete a twin with its archive, models and jobs."""
-    service.registry.remove(twin.name)
-    await service.database.write(twins.delete, twin.name)
+    await service.remove_twin(twin)

@@ -120,6 +120,7 @@ def _residuals_and_anomalies(connection: sqlite3.Connection) -> None:
             twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
             version INTEGER NOT NULL,
             time_us INTEGER NOT NULL,
+            n INTEGER NOT NULL,
             state TEXT NOT NULL,
             PRIMARY KEY (twin, version, time_us)
         ) WITHOUT ROWID;

@@ -2,11 +2,12 @@
 
 import sqlite3
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import orjson
 
-from service.instants import format_instant, now_us
+from service.instants import format_instant, now_us, parse_instant
 from service.problems import Problem
 
 
@@ -36,8 +37,28 @@ class Active:
     """The active model: its version and everything needed to run it."""
 
     version: int
-    epoch_us: int
+    summary: dict[str, Any]
     document: str
+
+    @property
+    def epoch_us(self) -> int:
+        """Where the model's time axis begins."""
+        return int(self.summary["epoch_us"])
+
+    @property
+    def train_stop_us(self) -> int | None:
+        """Last instant of the data that it was fitted to, if it says so."""
+        stop = self.summary["train"].get("stop")
+        return parse_instant(stop, "train.stop") if isinstance(stop, str) else None
+
+    @cached_property
+    def parsed_step_s(self) -> float:
+        """Longest time step of its rollouts."""
+        return float(self.parsed()["max_step_s"])
+
+    def parsed(self) -> dict[str, Any]:
+        """Return the document as data."""
+        return dict(orjson.loads(self.document))
 
 
 _SELECT = """
@@ -109,4 +130,10 @@ def active(connection: sqlite3.Connection, twin: int) -> Active | None:
            WHERE activation.twin = ? ORDER BY activation.id DESC LIMIT 1""",
         (twin,),
     ).fetchone()
-    return None if row is None else Active(row[0], orjson.loads(row[1])["epoch_us"], row[2])
+    return None if row is None else Active(row[0], orjson.loads(row[1]), row[2])
+
+
+def first_us(connection: sqlite3.Connection, twin: int) -> int:
+    """Return the first instant of a twin's archive, where the time axis of a new model begins; 0 if it is empty."""
+    row = connection.execute("SELECT first_us FROM head WHERE twin = ?", (twin,)).fetchone()
+    return int(row[0] or 0)

@@ -199,3 +199,14 @@ def since_seq(
     numbers = np.concatenate(seqs)
     order = np.argsort(numbers)
     return numbers[order], Samples(np.concatenate(times)[order], np.concatenate(values, axis=1)[:, order])
+
+
+def block_stop(connection: sqlite3.Connection, twin: int, start_us: int | None, n_rows: int) -> int | None:
+    """Return an instant before which about ``n_rows`` samples lie, counted from ``start_us``; None if fewer are left."""
+    query = "SELECT last_us, n FROM chunk WHERE twin = ? AND last_us > ? ORDER BY last_us"
+    total = 0
+    for last_us, n in connection.execute(query, (twin, -(2**62) if start_us is None else start_us)):
+        total += n
+        if total >= n_rows:
+            return int(last_us) + 1
+    return None

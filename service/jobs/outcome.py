@@ -1,0 +1,120 @@
+"""What becomes of a finished job: a new model version, perhaps active, and the messages that say so."""
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from service.instants import now_us
+from service.messages import EventStretch, Stretch
+from service.store import events, jobs, models
+from service.workbench import Outcome
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A job's outcome on its way into the store."""
+
+    job: str
+    kind: str
+    outcome: Outcome
+    provenance: Json
+    rival: int | None
+    activate: bool | None
+
+
+def save(connection: sqlite3.Connection, twin: int, finished: Finished) -> tuple[int | None, Sequence[Stretch]]:
+    """Store version, activation and result in one transaction; return the version that is active now if it changed."""
+    if finished.kind == "diagnosis" and not (finished.outcome.report or {}).get("findings"):
+        return None, _end(connection, twin, finished, None, None)
+    version = models.add(connection, twin, finished.kind, _summary(finished), finished.outcome.document)
+    reason = _reason_to_activate(connection, twin, finished)
+    if reason is not None:
+        models.activate(connection, twin, version, reason)
+    stretches = _end(connection, twin, finished, version, reason)
+    return (version if reason is not None else None), stretches
+
+
+def _summary(finished: Finished) -> Json:
+    outcome = finished.outcome
+    return {
+        "train": outcome.train,
+        "validation": outcome.validation,
+        "effects": outcome.effects,
+        "epoch_us": finished.provenance["epoch_us"],
+        "provenance": {**finished.provenance, "job": finished.job},
+        **outcome.extra,
+    }
+
+
+def _reason_to_activate(connection: sqlite3.Connection, twin: int, finished: Finished) -> str | None:
+    """Return why the new model becomes the active one, or None if it does not."""
+    if finished.activate is not None:
+        return "requested" if finished.activate else None
+    if finished.kind == "diagnosis":
+        return None
+    active = models.active(connection, twin)
+    if active is None:
+        return "the first model"
+    new, old = finished.outcome.validation.get("rmse_K"), finished.outcome.rival_rmse_K
+    if new is None or old is None or active.version != finished.rival or not new < old:
+        return None
+    return f"better on recent data: {new:.3g} K against {old:.3g} K of version {active.version}"
+
+
+def _end(
+    connection: sqlite3.Connection, twin: int, finished: Finished, version: int | None, reason: str | None
+) -> Sequence[Stretch]:
+    outcome = finished.outcome
+    result: Json = {"model_version": version, "version": version, "activated": reason is not None}
+    if outcome.report is not None:
+        result = {**outcome.report, **result}
+    else:
+        result |= {"reason": reason, "validation": outcome.validation, "rival_rmse_K": outcome.rival_rmse_K}
+    if not jobs.finish(connection, finished.job, "succeeded", "done", result, outcome.page):
+        raise LookupError(f"job {finished.job} has ended already")
+    messages: list[tuple[str, Json]] = []
+    if version is not None:
+        messages.append(("model", {"version": version, "active": reason is not None, "source": finished.kind}))
+    messages.append(("job", {"job": _brief(connection, twin, finished.kind, finished.job)}))
+    return [EventStretch(tuple(events.append(connection, twin, now_us(), messages)))]
+
+
+def _brief(connection: sqlite3.Connection, twin: int, kind: str, job: str) -> Json:
+    """Return a job for the stream; its result may be large and is fetched by those who want it."""
+    wire = jobs.get(connection, twin, kind, job).wire()
+    if kind == "diagnosis" and wire["result"] is not None:
+        wire["result"] = {name: wire["result"].get(name) for name in ("verdict", "model_version", "activated")}
+    return wire
+
+
+def announce(
+    connection: sqlite3.Connection, twin: int, kind: str, job: str, change: Any, *args: Any
+) -> tuple[Json, Sequence[Stretch]]:
+    """Apply ``change(connection, ...)`` to a job and tell the stream how it stands now."""
+    change(connection, *args)
+    wire = _brief(connection, twin, kind, job)
+    return wire, [EventStretch(tuple(events.append(connection, twin, now_us(), [("job", {"job": wire})])))]
+
+
+def activate(
+    connection: sqlite3.Connection, twin: int, version: int, reason: str
+) -> tuple[models.ModelRow, Sequence[Stretch]]:
+    """Make a version the active one and tell the stream."""
+    models.activate(connection, twin, version, reason)
+    row = models.get(connection, twin, version)
+    body = {"version": version, "active": True, "source": row.source}
+    return row, [EventStretch(tuple(events.append(connection, twin, now_us(), [("model", body)])))]
+
+
+def add_manual(
+    connection: sqlite3.Connection, twin: int, outcome: Outcome, provenance: Json
+) -> tuple[models.ModelRow, Sequence[Stretch]]:
+    """Store a model that was made elsewhere as a new, inactive version."""
+    summary = _summary(Finished("", "manual", outcome, provenance, None, False))
+    version = models.add(connection, twin, "manual", summary, outcome.document)
+    row = models.get(connection, twin, version)
+    body = {"version": version, "active": False, "source": "manual"}
+    return row, [EventStretch(tuple(events.append(connection, twin, now_us(), [("model", body)])))]

@@ -1,0 +1,225 @@
+"""Runs calibrations and diagnoses: queue, progress, cancel, outcome."""
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.instants import parse_instant
+from service.jobs import outcome
+from service.jobs.executor import Cancel, JobCancelled, JobFailed, ProcessPerTask
+from service.jobs.outcome import Finished
+from service.metrics import Metrics
+from service.problems import Problem
+from service.registry import Entry
+from service.store import jobs, models, samples
+from service.store.database import Database
+from service.store.jobs import JobRow
+from service.store.models import Active
+from service.streams import Hub
+from service.workbench import CalibrationTask, DiagnosisTask, Telemetry, Workbench, work
+from twin_core import __version__
+
+log = logging.getLogger("service.jobs")
+
+REPORT_EVERY_S = 0.3
+VALIDATION_SHARE = 0.2
+"""Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
+LEAST_VALIDATION = 20
+LEAST_SAMPLES = 20
+
+Json = dict[str, Any]
+
+
+@dataclass
+class _Running:
+    """A job that has not ended."""
+
+    cancel: Cancel
+    task: "asyncio.Task[None] | None" = None
+
+
+class Jobs:
+    """The jobs of this service."""
+
+    def __init__(
+        self,
+        database: Database,
+        hub: Hub,
+        metrics: Metrics,
+        workbench: type[Workbench],
+        workers: int,
+        deadline_s: float,
+        on_model: Callable[[int], None],
+    ) -> None:
+        """Run at most ``workers`` jobs at a time; ``on_model`` hears of every twin whose active model changed."""
+        self._database, self._hub, self._metrics = database, hub, metrics
+        self._workbench, self._on_model = workbench, on_model
+        self._executor = ProcessPerTask(workers, deadline_s)
+        self._free = asyncio.Semaphore(workers)
+        self._running: dict[str, _Running] = {}
+
+    async def start(self, twin: Entry, kind: str, request: Json) -> JobRow:
+        """Queue a job and return it."""
+        job = uuid.uuid4().hex[:12]
+        row = await self._database.write(jobs.create, twin.key, job, kind, request)
+        running = _Running(Cancel())
+        self._running[job] = running
+        running.task = asyncio.create_task(self._run(twin, row, request, running.cancel))
+        return row
+
+    async def cancel(self, twin: Entry, kind: str, job: str) -> JobRow:
+        """End a job and return it; a job that has ended stays as it is."""
+        row = await self._database.read(jobs.get, twin.key, kind, job)
+        running = self._running.get(job)
+        if running is not None and running.task is not None:
+            running.cancel.request()
+            await asyncio.wait([running.task])
+            row = await self._database.read(jobs.get, twin.key, kind, job)
+        return row
+
+    async def cancel_twin(self, twin: Entry) -> None:
+        """End every job of a twin that is about to go."""
+        for kind in ("calibration", "diagnosis"):
+            for row in await self._database.read(jobs.select, twin.key, kind):
+                if row.state in ("queued", "running"):
+                    await self.cancel(twin, kind, row.id)
+
+    async def close(self) -> None:
+        """End every job; each is marked as it ends."""
+        for running in self._running.values():
+            running.cancel.request()
+        tasks = [running.task for running in self._running.values() if running.task is not None]
+        if tasks:
+            await asyncio.wait(tasks)
+        await asyncio.to_thread(self._executor.shutdown)
+
+    async def _run(self, twin: Entry, row: JobRow, request: Json, cancel: Cancel) -> None:
+        state, message = "failed", ""
+        try:
+            await self._wait_for_turn(cancel)
+            try:
+                self._metrics.jobs_running.inc()
+                await self._work(twin, row, request, cancel)
+                state = "succeeded"
+            finally:
+                self._metrics.jobs_running.dec()
+                self._free.release()
+        except JobCancelled:
+            state, message = "cancelled", "cancelled"
+        except (JobFailed, Problem) as error:
+            message = error.detail if isinstance(error, Problem) else str(error)
+        except Exception as error:
+            message = f"{type(error).__name__}: {error}"
+            log.exception("a job failed unexpectedly", extra={"job": row.id, "kind": row.kind})
+        finally:
+            self._running.pop(row.id, None)
+        self._metrics.jobs.labels(row.kind, state).inc()
+        if state != "succeeded":
+            await self._end(twin, row, state, message)
+
+    async def _wait_for_turn(self, cancel: Cancel) -> None:
+        """Return once a worker is free."""
+        while True:
+            if cancel.requested:
+                raise JobCancelled
+            try:
+                async with asyncio.timeout(0.1):
+                    await self._free.acquire()
+                    return
+            except TimeoutError:
+                continue
+
+    async def _end(self, twin: Entry, row: JobRow, state: str, message: str) -> None:
+        change = (jobs.finish, row.id, state, message)
+        try:
+            await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
+        except (LookupError, Problem):
+            log.info("a job ended after its twin was deleted", extra={"job": row.id})
+
+    async def _work(self, twin: Entry, row: JobRow, request: Json, cancel: Cancel) -> None:
+        """Do a job whose turn it is."""
+        await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, jobs.begin, row.id)
+        telemetry = await self.telemetry(twin, request.get("start"), request.get("stop"))
+        active = await self._database.read(models.active, twin.key)
+        task, function = self._task(twin, row.kind, request, telemetry, active)
+        progress = self._reporter(twin, row)
+        future = self._executor.start(work, (self._workbench, function, task), {}, progress, cancel)
+        made = await asyncio.wrap_future(future)
+        provenance = {
+            "data_sha256": telemetry.sha256(),
+            "settings": request,
+            "code_version": __version__,
+            "epoch_us": telemetry.epoch_us,
+            "parent": None if active is None else active.version,
+        }
+        finished = Finished(
+            row.id, row.kind, made, provenance, None if active is None else active.version, _wish(row, request)
+        )
+        if await self._hub.write(twin.key, outcome.save, twin.key, finished) is not None:
+            self._on_model(twin.key)
+
+    def _task(
+        self, twin: Entry, kind: str, request: Json, telemetry: Telemetry, active: Active | None
+    ) -> tuple[CalibrationTask | DiagnosisTask, str]:
+        if kind == "diagnosis":
+            options = {name: request[name] for name in ("holdout", "burn_in_s", "false_alarm_rate")}
+            return DiagnosisTask(twin.specification, telemetry, **options), "diagnose"
+        rival = None if active is None else active.parsed()
+        cut = validation_start(telemetry, None if active is None else active.train_stop_us)
+        return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival), "calibrate"
+
+    async def telemetry(self, twin: Entry, start: Any, stop: Any) -> Telemetry:
+        """Return a part of the archive for a worker; Problem 422 if it holds too little."""
+        start_us = None if start is None else parse_instant(start, "start")
+        stop_us = None if stop is None else parse_instant(stop, "stop")
+        n = len(twin.channels)
+        found = await self._database.read(samples.select, twin.key, n, range(n), start_us, stop_us)
+        if found.time_us.size < LEAST_SAMPLES:
+            raise Problem(422, f"the archive holds {found.time_us.size} samples there, {LEAST_SAMPLES} are needed")
+        values = {name: np.ascontiguousarray(found.values[i]) for i, name in enumerate(twin.channels)}
+        present = {name: column for name, column in values.items() if np.isfinite(column).any()}
+        return Telemetry(int(found.time_us[0]), found.time_us, present)
+
+    def _reporter(self, twin: Entry, row: JobRow) -> Callable[[float, str], None]:
+        """Return a progress callback for worker threads that writes now and then."""
+        last_s = 0.0
+
+        def report(fraction: float, message: str) -> None:
+            nonlocal last_s
+            now_s = time.monotonic()
+            if now_s - last_s >= REPORT_EVERY_S or fraction >= 1.0:
+                last_s = now_s
+                change = (jobs.report, row.id, min(max(fraction, 0.0), 1.0), message)
+                self._hub.submit(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
+
+        return report
+
+
+def _wish(row: JobRow, request: Json) -> bool | None:
+    """Return whether the caller wants the new model active: True, False, or None for 'if it is the better one'."""
+    wish = request["activate"]
+    if row.kind == "diagnosis":
+        return bool(wish)
+    return None if wish is None else bool(wish)
+
+
+def validation_start(telemetry: Telemetry, active_stop_us: int | None) -> int:
+    """Return where the data begin that neither the new model nor the active one may have been fitted to.
+
+    That is the last fifth of the time span, or what came after the active model's training data if that is shorter;
+    the end of the archive if too few samples would be left to score or to train on.
+    """
+    first, last = int(telemetry.time_us[0]), int(telemetry.time_us[-1])
+    cut = int(first + (1.0 - VALIDATION_SHARE) * (last - first))
+    if active_stop_us is not None:
+        cut = max(cut, active_stop_us + 1)
+    position = int(np.searchsorted(telemetry.time_us, cut))
+    if telemetry.time_us.size - position < LEAST_VALIDATION or position < LEAST_SAMPLES:
+        return last + 1
+    return cut

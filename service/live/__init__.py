@@ -1,0 +1,1 @@
+"""The live state: assimilation of what arrives, and forecasts from there."""

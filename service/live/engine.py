@@ -1,0 +1,72 @@
+"""The engine: standing worker processes for assimilation and forecasts, replaced when one dies."""
+
+import asyncio
+import logging
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import ParamSpec, TypeVar
+
+from service.jobs.executor import prepare_worker
+from service.problems import Problem
+from service.workbench import Filtered, Forecasted, ForecastTask, Json, Outcome, Telemetry, Workbench
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+WORKERS = 2
+log = logging.getLogger("service.live")
+
+
+class Engine:
+    """Runs quick questions to a workbench outside of the server's process."""
+
+    def __init__(self, workbench: type[Workbench]) -> None:
+        """Start nothing yet: the first question starts the first process."""
+        self._workbench = workbench
+        self._pool: ProcessPoolExecutor | None = None
+
+    async def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        """Filter a stretch of telemetry."""
+        return await self._ask(_assimilate, self._workbench, document, telemetry, state)
+
+    async def forecast(self, document: str, task: ForecastTask) -> Forecasted:
+        """Look ahead."""
+        return await self._ask(_forecast, self._workbench, document, task)
+
+    async def inspect(self, document: Json) -> Outcome:
+        """Check a model that was made elsewhere."""
+        return await self._ask(_inspect, self._workbench, document)
+
+    async def close(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            await asyncio.to_thread(self._pool.shutdown, True, cancel_futures=True)
+
+    async def _ask(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        for _ in range(2):
+            pool = self._pool = self._pool or self._start()
+            try:
+                return await asyncio.wrap_future(pool.submit(function, *args, **kwargs))
+            except BrokenProcessPool:
+                log.warning("a worker process died; another one takes over")
+                if self._pool is pool:
+                    self._pool = None
+        raise Problem(503, "the worker process died twice over this request; try again or recalibrate")
+
+    def _start(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(WORKERS, mp_context=context, initializer=prepare_worker)
+
+
+def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    return workbench().assimilate(document, telemetry, state)
+
+
+def _forecast(workbench: type[Workbench], document: str, task: ForecastTask) -> Forecasted:
+    return workbench().forecast(document, task)
+
+
+def _inspect(workbench: type[Workbench], document: Json) -> Outcome:
+    return workbench().inspect(document)

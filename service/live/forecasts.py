@@ -1,0 +1,91 @@
+"""Forecasts from the assimilated state, with planned inputs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from service.instants import format_instant, format_instants, now_us, parse_instants
+from service.live.tracker import Position, Tracker
+from service.problems import BadField, Problem
+from service.registry import Entry
+from service.schemas import Columns, ForecastRequest
+from service.store.models import Active
+from service.workbench import Forecasted, ForecastTask, Telemetry
+
+SETTLE_S = 10.0
+"""How long a forecast waits for samples that are stored but not yet assimilated."""
+MOST_POINTS = 20_000
+MOST_STEPS = 200_000
+
+Json = dict[str, Any]
+
+
+async def state_of(tracker: Tracker) -> tuple[Active, Position]:
+    """Return the active model and its present state; Problem 409 if there is none."""
+    settled = await tracker.settled(SETTLE_S)
+    if tracker.active is None:
+        raise Problem(409, "no model is active; calibrate first, or activate a version")
+    if tracker.position is None:
+        reason = tracker.trouble or ("the archive is empty" if settled else "the archive is still being assimilated")
+        raise Problem(409, f"the state is not known: {reason}")
+    return tracker.active, tracker.position
+
+
+def build_task(twin: Entry, active: Active, position: Position, request: ForecastRequest) -> ForecastTask:
+    """Return what a worker needs for a forecast; BadField if the request asks for too much."""
+    step_s = request.step_s or min(position.sampling_s, request.horizon_s)
+    if step_s > request.horizon_s:
+        raise BadField("step_s", f"must be at most the horizon ({request.horizon_s:g} s), got {step_s:g}")
+    if request.horizon_s / step_s > MOST_POINTS:
+        if request.step_s is not None:
+            raise BadField("step_s", f"gives more than {MOST_POINTS} points; take a longer step")
+        step_s = request.horizon_s / MOST_POINTS
+    longest_s = MOST_STEPS * float(active.parsed_step_s)
+    if request.horizon_s > longest_s:
+        raise BadField("horizon_s", f"must be at most {longest_s:g} s for this model")
+    start = np.array([position.time_us], dtype=np.int64)
+    values = {name: np.array([value]) for name, value in position.held.items()}
+    values |= {name: np.array([np.nan]) for name in twin.sensors}
+    telemetry = Telemetry(active.epoch_us, start, values)
+    plan = None if request.plan is None else _plan(twin, request.plan, active.epoch_us)
+    return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, tuple(request.quantiles))
+
+
+def _plan(twin: Entry, plan: Columns, epoch_us: int) -> Telemetry | None:
+    """Return the planned inputs in the order of time."""
+    for name, column in plan.values.items():
+        if name not in twin.channels:
+            raise BadField(f"plan.values.{name}", f"unknown channel '{name}' (known: {', '.join(twin.channels)})")
+        if len(column) != len(plan.time):
+            raise BadField(f"plan.values.{name}", f"has {len(column)} values, time has {len(plan.time)}")
+    time_us = parse_instants(plan.time, "plan.time")
+    if time_us.size == 0:
+        return None
+    order = np.argsort(time_us, kind="stable")
+    if (np.diff(time_us[order]) == 0).any():
+        raise BadField("plan.time", "names an instant twice")
+    values = {name: np.array(column, dtype=np.float64)[order] for name, column in plan.values.items()}
+    return Telemetry(epoch_us, time_us[order], values)
+
+
+def quantile_name(probability: float) -> str:
+    """Return ``q05`` for 0.05, ``q50`` for 0.5, ``q97.5`` for 0.975."""
+    percent = round(100.0 * probability, 6)
+    return f"q{percent:02.0f}" if percent.is_integer() else f"q{percent:g}"
+
+
+def render(twin: Entry, active: Active, position: Position, made: Forecasted, quantiles: Sequence[float]) -> Json:
+    """Return a forecast as clients see it."""
+    values = {
+        sensor: {"mean": mean.tolist()} | {quantile_name(q): made.quantiles[q][sensor].tolist() for q in quantiles}
+        for sensor, mean in made.mean.items()
+    }
+    return {
+        "model_version": active.version,
+        "issued": format_instant(now_us()),
+        "from": format_instant(position.time_us),
+        "time": format_instants(made.time_us),
+        "values": values,
+        "units": {sensor: twin.units[sensor] for sensor in made.mean},
+    }

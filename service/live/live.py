@@ -1,0 +1,57 @@
+"""The live state of every twin: one tracker each, and the engine they share."""
+
+from numpy.typing import NDArray
+
+from service.live.engine import Engine
+from service.live.tracker import Tracker
+from service.registry import Entry
+from service.store.database import Database
+from service.streams import Hub
+from service.workbench import Json, Outcome, Workbench
+
+
+class Live:
+    """Every tracker of this service."""
+
+    def __init__(self, database: Database, hub: Hub, workbench: type[Workbench]) -> None:
+        """Start without twins."""
+        self.engine = Engine(workbench)
+        self._database, self._hub = database, hub
+        self._trackers: dict[int, Tracker] = {}
+
+    def add(self, twin: Entry) -> None:
+        """Begin to track a twin."""
+        if twin.key not in self._trackers:
+            self._trackers[twin.key] = Tracker(twin, self._database, self._hub, self.engine)
+
+    async def remove(self, twin: Entry) -> None:
+        """Stop tracking a twin."""
+        tracker = self._trackers.pop(twin.key, None)
+        if tracker is not None:
+            await tracker.close()
+
+    def tracker(self, twin: Entry) -> Tracker:
+        """Return the tracker of a twin."""
+        return self._trackers[twin.key]
+
+    def arrived(self, twin: Entry, time_us: NDArray) -> None:
+        """Pass on that samples were stored."""
+        tracker = self._trackers.get(twin.key)
+        if tracker is not None:
+            tracker.arrived(time_us)
+
+    def model_changed(self, twin: int) -> None:
+        """Pass on that another model is active."""
+        tracker = self._trackers.get(twin)
+        if tracker is not None:
+            tracker.model_changed()
+
+    async def inspect(self, document: Json) -> Outcome:
+        """Check a model that was made elsewhere."""
+        return await self.engine.inspect(document)
+
+    async def close(self) -> None:
+        """Stop everything."""
+        for tracker in self._trackers.values():
+            await tracker.close()
+        await self.engine.close()

@@ -1,0 +1,92 @@
+"""What the live state tells: forecasts, residuals, anomalies."""
+
+import asyncio
+from typing import Annotated, Any
+
+import numpy as np
+import orjson
+from fastapi import APIRouter, Query, Response
+
+from service.deps import NamedTwin, Running, Service, reads
+from service.downsample import extremes
+from service.instants import format_instants
+from service.live import forecasts
+from service.registry import Entry
+from service.routes.telemetry import MOST_POINTS, span
+from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Residuals
+from service.store import anomalies, residuals
+from service.store.residuals import Residuals as Found
+
+router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
+
+Start = Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")]
+Stop = Annotated[str | None, Query(description="First instant after the last one wanted.")]
+Seconds = Annotated[float, Query(gt=0, allow_inf_nan=False)]
+SecondsOrNone = Annotated[float | None, Query(gt=0, allow_inf_nan=False)]
+
+
+@router.post("/forecasts", dependencies=[reads], response_model=Forecast)
+async def forecast(service: Running, twin: NamedTwin, request: ForecastRequest) -> Response:
+    """Look ahead from the assimilated state with planned inputs."""
+    return await _forecast(service, twin, request)
+
+
+@router.get("/forecast", dependencies=[reads], response_model=Forecast)
+async def forecast_as_is(
+    service: Running, twin: NamedTwin, horizon_s: Seconds, step_s: SecondsOrNone = None
+) -> Response:
+    """Look ahead from the assimilated state with the inputs as they are now."""
+    return await _forecast(service, twin, ForecastRequest(horizon_s=horizon_s, step_s=step_s))
+
+
+async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
+    active, position = await forecasts.state_of(service.live.tracker(twin))
+    task = forecasts.build_task(twin, active, position, request)
+    made = await service.live.engine.forecast(active.document, task)
+    document = forecasts.render(twin, active, position, made, request.quantiles)
+    return Response(orjson.dumps(document), media_type="application/json")
+
+
+@router.get("/residuals", dependencies=[reads], response_model=Residuals)
+async def list_residuals(
+    service: Running,
+    twin: NamedTwin,
+    start: Start = None,
+    stop: Stop = None,
+    version: Annotated[int | None, Query(ge=1, le=2**62, description="Of the model; absent: the active one.")] = None,
+    max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
+) -> Response:
+    """Return innovations, their predicted standard deviations and the NIS."""
+    start_us, stop_us = span(start, stop)
+    tracker = service.live.tracker(twin)
+    await tracker.settled(forecasts.SETTLE_S)
+    chosen = version or (tracker.active.version if tracker.active is not None else 0)
+    n_sensors = len(twin.sensors)
+    found = await service.database.read(residuals.select, twin.key, chosen, n_sensors, start_us, stop_us)
+    document = await asyncio.to_thread(_render, twin, found, max_points)
+    return Response(document, media_type="application/json")
+
+
+def _render(twin: Entry, found: Found, max_points: int) -> bytes:
+    kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
+
+    def columns(matrix: Any) -> dict[str, Any]:
+        return {name: np.ascontiguousarray(matrix[row, kept]) for row, name in enumerate(twin.sensors)}
+
+    document = {
+        "time": format_instants(found.time_us[kept]),
+        "residual_K": columns(found.innovation_K),
+        "std_K": columns(found.innovation_std_K),
+        "nis": np.ascontiguousarray(found.nis[kept]),
+        "model_version": [found.version] * int(kept.size),
+        "samples": int(found.time_us.size),
+        "downsampled": kept.size < found.time_us.size,
+    }
+    return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+@router.get("/anomalies", dependencies=[reads])
+async def list_anomalies(service: Running, twin: NamedTwin, start: Start = None, stop: Stop = None) -> AnomalyList:
+    """List the intervals in which a sensor did not behave as its model, the newest first."""
+    rows = await service.database.read(anomalies.select, twin.key, *span(start, stop))
+    return AnomalyList(anomalies=[Anomaly(**row.wire()) for row in rows])

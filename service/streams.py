@@ -1,0 +1,170 @@
+"""Live streams: every reader walks along the twin's numbered messages at its own pace.
+
+Nothing is queued per reader. A reader is a position in the stream; what it wants next comes from the recent past in
+memory or else from the store, and a reader that lags too far is told so and moved ahead. Writers never wait.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Sequence
+from concurrent.futures import Future
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from service.messages import Json, Stretch, dropped
+from service.metrics import Metrics
+from service.registry import Entry
+from service.store import stream
+from service.store.database import Database
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+AT_ONCE = 256
+"""Most messages handed to a reader in one piece."""
+IDLE_S = 15.0
+"""An idle reader gets an empty piece this often, so that dead connections are noticed."""
+
+
+class Topic:
+    """The stream of one twin."""
+
+    def __init__(self, head: int) -> None:
+        """Start after the last number that was given out."""
+        self.head = head
+        self.oldest = head
+        self.recent: deque[Stretch] = deque()
+        self.wakers: set[asyncio.Event] = set()
+        self.closed = False
+
+    def push(self, stretch: Stretch, most: int) -> None:
+        """Take in new messages and forget what lies more than ``most`` numbers back."""
+        self.recent.append(stretch)
+        self.head = max(self.head, int(stretch.seqs[-1]))
+        while self.recent and self.head - int(self.recent[0].seqs[-1]) > most:
+            self.oldest = int(self.recent.popleft().seqs[-1])
+        self.wake()
+
+    def wake(self) -> None:
+        """Let every reader look again."""
+        for waker in self.wakers:
+            waker.set()
+
+    def since(self, after_seq: int, count: int) -> list[Json]:
+        """Return the first messages after a number, from memory."""
+        messages: list[Json] = []
+        for stretch in self.recent:
+            if int(stretch.seqs[-1]) > after_seq:
+                for message in stretch.messages(after_seq):
+                    messages.append(message)
+                    if len(messages) == count:
+                        return messages
+        return messages
+
+
+class Hub:
+    """The streams of all twins."""
+
+    def __init__(self, database: Database, metrics: Metrics, buffer: int) -> None:
+        """Readers may lag ``buffer`` messages behind."""
+        self._database, self._metrics, self._buffer = database, metrics, buffer
+        self._loop = asyncio.get_running_loop()
+        self._topics: dict[int, Topic] = {}
+
+    def open(self, twin: int, head: int) -> None:
+        """Start the stream of a twin."""
+        self._topics.setdefault(twin, Topic(head))
+
+    def close(self, twin: int | None = None) -> None:
+        """End the streams of one twin, or all."""
+        for key in [twin] if twin is not None else list(self._topics):
+            topic = self._topics.pop(key, None)
+            if topic is not None:
+                topic.closed = True
+                topic.wake()
+
+    def publish(self, twin: int, stretches: Sequence[Stretch]) -> None:
+        """Add committed messages; in the event loop, in the order of the commits."""
+        topic = self._topics.get(twin)
+        for stretch in stretches:
+            if topic is not None and stretch.seqs.size:
+                topic.push(stretch, self._buffer)
+
+    def submit(
+        self,
+        twin: int,
+        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> "Future[tuple[T, Sequence[Stretch]]]":
+        """Queue a write that makes messages; they are published right after its commit. From any thread."""
+        answer = self._database.submit(operation, *args, **kwargs)
+        answer.add_done_callback(lambda done: self._after_commit(twin, done))
+        return answer
+
+    def _after_commit(self, twin: int, done: "Future[tuple[Any, Sequence[Stretch]]]") -> None:
+        """Hand the messages to the event loop; the writer calls this in the order of the commits."""
+        if not done.cancelled() and done.exception() is None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self.publish, twin, done.result()[1])
+
+    async def write(
+        self,
+        twin: int,
+        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> T:
+        """Return the result of a write that makes messages, once it is committed."""
+        answer = self.submit(twin, operation, *args, **kwargs)
+        return (await asyncio.shield(asyncio.wrap_future(answer)))[0]
+
+    async def follow(self, twin: Entry, after_seq: int | None) -> AsyncIterator[list[Json]]:
+        """Yield messages in pieces, from a number on or from now on, until the twin or the service goes."""
+        topic = self._topics[twin.key]
+        position = topic.head if after_seq is None else min(after_seq, topic.head)
+        waker = asyncio.Event()
+        topic.wakers.add(waker)
+        self._metrics.readers.inc()
+        try:
+            while not topic.closed:
+                waker.clear()
+                if position < topic.head:
+                    piece, position = await self._next(twin, topic, position)
+                    yield piece
+                elif not await _wait(waker):
+                    yield []
+        finally:
+            topic.wakers.discard(waker)
+            self._metrics.readers.dec()
+
+    async def _next(self, twin: Entry, topic: Topic, position: int) -> tuple[list[Json], int]:
+        """Return the next piece for a reader and its new position."""
+        if topic.head - position > self._buffer:
+            return self._skip(position, topic.head - self._buffer)
+        if position >= topic.oldest:
+            messages = topic.since(position, AT_ONCE)
+        else:
+            names = (twin.channels, twin.sensors)
+            messages = await self._database.read(stream.since_seq, twin.key, *names, position, AT_ONCE)
+        if not messages:
+            return self._skip(position, topic.head)
+        first, last = int(messages[0]["seq"]), int(messages[-1]["seq"])
+        if last - position == len(messages):
+            return messages, last
+        if first > position + 1:
+            return self._skip(position, first - 1)
+        whole = next(i for i, message in enumerate(messages) if message["seq"] != position + 1 + i)
+        return messages[:whole], position + whole
+
+    def _skip(self, position: int, last: int) -> tuple[list[Json], int]:
+        """Tell a reader that everything up to ``last`` is lost to it."""
+        self._metrics.dropped.inc(last - position)
+        return [dropped(position + 1, last)], last
+
+
+async def _wait(waker: asyncio.Event) -> bool:
+    try:
+        async with asyncio.timeout(IDLE_S):
+            await waker.wait()
+    except TimeoutError:
+        return False
+    return True
