@@ -1,0 +1,148 @@
+"""The thermal network as an SVG picture, with what was found drawn into it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.discover.phrasing import in_words, number
+
+WIDTH, HEIGHT, MARGIN = 900.0, 400.0, 64.0
+_LABEL_ROOM = 70.0
+_LONGEST = 24
+_STEPS = 200
+
+
+def draw_network(network: Mapping[str, Any]) -> str:
+    """Return the picture as an ``<svg>`` element whose colours come from the page's style sheet.
+
+    Parameters
+    ----------
+    network
+        ``nodes``, ``boundaries``, ``conductors`` [a, b, W/K], ``radiators`` [node, sink] and ``effects``.
+
+    Returns
+    -------
+    str
+        Empty where there are no nodes. Every name is escaped.
+    """
+    nodes, boundaries = list(network.get("nodes") or []), list(network.get("boundaries") or [])
+    if not nodes:
+        return ""
+    conductors, radiators = network.get("conductors") or [], network.get("radiators") or []
+    effects = network.get("effects") or []
+    joined = [(c[0], c[1]) for c in conductors] + [(r[0], r[1]) for r in radiators]
+    at = _positions([*nodes, *boundaries], joined + [pair for e in effects if (pair := _ends(e)) is not None])
+    parts = [_line(at, a, b, "conductor", f"{number(G, 2)} W/K") for a, b, G in conductors]
+    parts += [_line(at, node, sink, "radiator", "", bend=18.0) for node, sink in radiators]
+    parts += [_effect(at, effect) for effect in effects]
+    parts += [_box(at, name) for name in boundaries] + [_disc(at, name) for name in nodes]
+    label = f"Thermal network of {len(nodes)} nodes"
+    return f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def _ends(effect: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Return the two places that an effect joins, None where it acts on one place alone."""
+    where = effect.get("where") or {}
+    if "nodes" in where:
+        return where["nodes"][0], where["nodes"][1]
+    other = where.get("sink") or where.get("boundary")
+    return (where["node"], other) if "node" in where and other else None
+
+
+def _positions(names: Sequence[str], edges: Sequence[tuple[str, str]]) -> dict[str, tuple[float, float]]:
+    """Place names so that drawn distances follow the number of edges between them.
+
+    Stress majorisation (Gansner, Koren and North, "Graph drawing by stress majorization", 2004, eq. 10), from a circle.
+    """
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    n = len(index)
+    if n == 1:
+        return {names[0]: (WIDTH / 2, HEIGHT / 2)}
+    distance = _distances(n, [(index[a], index[b]) for a, b in edges if a in index and b in index])
+    weight = np.where(distance > 0, 1.0 / np.maximum(distance, 1e-9) ** 2, 0.0)
+    angle = 2.0 * math.pi * np.arange(n) / n
+    spots = np.stack([np.cos(angle), 0.6 * np.sin(angle)], axis=1) * n / 3
+    for _ in range(_STEPS):
+        apart = spots[:, None, :] - spots[None, :, :]
+        length = np.maximum(np.linalg.norm(apart, axis=2), 1e-6)
+        pull = spots[None, :, :] + apart * (distance / length)[:, :, None]
+        spots = np.einsum("ij,ijk->ik", weight, pull) / weight.sum(axis=1, keepdims=True)
+    return dict(zip(index, map(tuple, _fit(spots)), strict=True))
+
+
+def _distances(n: int, edges: Sequence[tuple[int, int]]) -> FloatArray:
+    """Return the number of edges between every two places, (n, n); unconnected ones are a little further than any."""
+    far = float(n)
+    distance = np.full((n, n), far)
+    np.fill_diagonal(distance, 0.0)
+    for a, b in edges:
+        distance[a, b] = distance[b, a] = 1.0
+    for via in range(n):
+        distance = np.minimum(distance, distance[:, via, None] + distance[None, via, :])
+    reached = distance[distance < far]
+    distance[distance >= far] = reached.max() + 1.0
+    np.fill_diagonal(distance, 0.0)
+    return distance
+
+
+def _fit(spots: FloatArray) -> FloatArray:
+    """Return the places turned so that the long side lies flat, scaled into the picture."""
+    centred = spots - spots.mean(axis=0)
+    _, _, axes = np.linalg.svd(centred, full_matrices=False)
+    turned = centred @ axes.T
+    low, span = turned.min(axis=0), np.maximum(np.ptp(turned, axis=0), 1e-9)
+    size = np.array([WIDTH - 2 * MARGIN, HEIGHT - 2 * MARGIN])
+    flat = span < 0.05 * span.max()
+    return np.where(flat, MARGIN + size / 2, MARGIN + (turned - low) / span * size)
+
+
+def _line(at: Mapping[str, tuple[float, float]], a: str, b: str, kind: str, label: str, *, bend: float = 0.0) -> str:
+    """Return a curve between two places with a label at its middle."""
+    if a not in at or b not in at:
+        return ""
+    (x0, y0), (x1, y1) = at[a], at[b]
+    length = math.hypot(x1 - x0, y1 - y0) or 1.0
+    across = (-(y1 - y0) / length * bend, (x1 - x0) / length * bend)
+    middle = ((x0 + x1) / 2 + across[0], (y0 + y1) / 2 + across[1])
+    control = (middle[0] + across[0], middle[1] + across[1])
+    curve = f'<path class="{kind}" d="M{x0:.1f} {y0:.1f}Q{control[0]:.1f} {control[1]:.1f} {x1:.1f} {y1:.1f}"/>'
+    beside = (middle[0] - 0.08 * (x1 - x0), middle[1] - 0.08 * (y1 - y0))  # lines often cross at their middles
+    return curve + (_text(beside, label, f"{kind}-label", -5.0) if label else "")
+
+
+def _effect(at: Mapping[str, tuple[float, float]], effect: Mapping[str, Any]) -> str:
+    """Return an effect: a curve between two places, or a ring around one; one of a channel is not drawn."""
+    name, where = in_words(str(effect.get("effect"))), effect.get("where") or {}
+    ends = _ends(effect)
+    if ends is not None:
+        return _line(at, *ends, "effect", name, bend=-26.0)
+    node = str(where.get("node"))
+    if node not in at:
+        return ""
+    return _pill(at[node], node, "effect", 8.0) + _text(at[node], name, "effect-label", -34.0)
+
+
+def _disc(at: Mapping[str, tuple[float, float]], name: str) -> str:
+    return _pill(at[name], name, "node", 0.0) + _text(at[name], name, "name", 4.0)
+
+
+def _box(at: Mapping[str, tuple[float, float]], name: str) -> str:
+    return _pill(at[name], name, "boundary", 0.0, corner=6.0) + _text(at[name], name, "name", 4.0)
+
+
+def _pill(spot: tuple[float, float], name: str, kind: str, margin: float, *, corner: float | None = None) -> str:
+    """Return a shape as wide as the name needs."""
+    width, height = max(46.0, 8.5 * min(len(name), _LONGEST) + 20.0) + 2 * margin, 38.0 + 2 * margin
+    x, y = spot[0] - width / 2, spot[1] - height / 2
+    radius = height / 2 if corner is None else corner
+    return f'<rect class="{kind}" x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:g}" rx="{radius:g}"/>'
+
+
+def _text(spot: tuple[float, float], text: str, kind: str, shift: float) -> str:
+    shown = text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
+    x = spot[0] if kind == "name" else min(max(spot[0], _LABEL_ROOM), WIDTH - _LABEL_ROOM)
+    return f'<text class="{kind}" x="{x:.1f}" y="{spot[1] + shift:.1f}">{escape(shown)}</text>'

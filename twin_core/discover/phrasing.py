@@ -1,0 +1,125 @@
+"""The verdict in words and numbers with units, for people."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from twin_core._typing import Json
+
+_UNITS = {
+    "_J_per_K": "J/K",
+    "_W_per_K": "W/K",
+    "_K_per_s": "K/s",
+    "_per_K": "1/K",
+    "_per_s": "1/s",
+    "_m2": "m²",
+    "_W": "W",
+    "_K": "K",
+    "_J": "J",
+    "_s": "s",
+}
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+DECISIVE, STRONG = 5.0, 3.0
+"""Log Bayes factors after Kass and Raftery, "Bayes factors", JASA 90 (1995): 5 is very strong, 3 strong."""
+
+
+def headline(report: Mapping[str, Any]) -> str:
+    """Return the verdict as one sentence."""
+    findings = report.get("findings") or []
+    verdict = report.get("verdict")
+    if verdict == "effect_added" and findings:
+        first = f"{in_words(findings[0]['effect'])} {place(findings[0].get('where') or {})}"
+        more = len(findings) - 1
+        others = f", and {more} more effect{'s' if more > 1 else ''}" if more else ""
+        return f"{first.strip().capitalize()} was missing from the model{others}."
+    if verdict == "unexplained":
+        return "Something is missing from the model, and no known effect explains it."
+    return "The declared model suffices: the data supports no missing effect."
+
+
+def gain(before_K: float | None, after_K: float | None) -> str:
+    """Return how the error changed: a factor where it fell a lot, a percentage otherwise."""
+    if not before_K or after_K is None or not math.isfinite(before_K) or not math.isfinite(after_K):
+        return ""
+    if after_K > 0 and before_K / after_K >= 2.0:
+        return f"{number(before_K / after_K, 2)} times smaller"
+    change = (after_K - before_K) / before_K
+    if abs(change) < 0.005:
+        return "unchanged"
+    return f"{abs(change):.0%} {'smaller' if change < 0 else 'larger'}"
+
+
+def strength(log_bayes_factor: float | None) -> str:
+    """Return how strong evidence is, in the words of Kass and Raftery."""
+    if log_bayes_factor is None or not math.isfinite(log_bayes_factor):
+        return ""
+    if log_bayes_factor >= DECISIVE:
+        return "very strong"
+    if log_bayes_factor >= STRONG:
+        return "strong"
+    return "positive" if log_bayes_factor >= 1.0 else "weak"
+
+
+def in_words(effect: str) -> str:
+    """Return the name of an effect as words."""
+    return effect.replace("_", " ")
+
+
+def place(where: Mapping[str, Any]) -> str:
+    """Return where an effect acts: ``from px to space``, ``between px and box``, ``at tank by channel pitch``."""
+    rest = dict(where)
+    parts = []
+    if "nodes" in rest:
+        parts.append(f"between {' and '.join(map(str, rest.pop('nodes')))}")
+    target = rest.pop("sink", None) or rest.pop("boundary", None)
+    if "node" in rest:
+        node = rest.pop("node")
+        parts.append(f"at {node}" if target is None else f"from {node} to {target}")
+    elif target is not None:
+        parts.append(f"to {target}")
+    if "channel" in rest:
+        parts.append(f"{'by' if parts else 'of'} channel {rest.pop('channel')}")
+    return " ".join([*parts, *(f"of {key} {value}" for key, value in rest.items())])
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """Return a number with a few significant digits; a dash where there is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    if decimals > 6 or decimals < -4:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
+    return f"{round(value, decimals):.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def with_spread(mean: Any, std: Any) -> str:
+    """Return ``mean ± std``, both cut where the spread makes further digits meaningless."""
+    if not isinstance(mean, int | float):
+        return str(mean) if isinstance(mean, str) else "–"
+    if not isinstance(std, int | float) or not math.isfinite(std) or std <= 0:
+        return number(mean, 4)
+    decimals = 1 - math.floor(math.log10(std))
+    if decimals > 8 or decimals < -6:
+        return f"{number(mean, 4)} ± {number(std, 2)}"
+    return f"{round(mean, decimals):.{max(decimals, 0)}f} ± {round(std, decimals):.{max(decimals, 0)}f}".replace(
+        "-", "−"
+    )
+
+
+def parameters(finding: Mapping[str, Any]) -> list[Json]:
+    """Return the parameters of a finding as symbol, text and unit; a table becomes one row per entry."""
+    rows = []
+    for name, value in (finding.get("parameters") or {}).items():
+        suffix = next((end for end in _UNITS if name.endswith(end)), "")
+        symbol, unit = name.removesuffix(suffix) or name, _UNITS.get(suffix, "")
+        mean, std = value.get("mean"), value.get("std")
+        if isinstance(mean, list):
+            stds = std if isinstance(std, list) else [None] * len(mean)
+            text = "; ".join(with_spread(m, s) for m, s in zip(mean, stds, strict=False))
+        else:
+            text = with_spread(mean, std)
+        rows.append({"symbol": symbol, "text": text, "unit": unit})
+    return rows
