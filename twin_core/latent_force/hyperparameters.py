@@ -1,0 +1,247 @@
+"""Hyperparameters by maximum a posteriori under Gamma priors, and their Laplace covariance.
+
+Kouw et al. (CCTA 2024), eqs. 30-32. The climb is Fisher scoring in logarithms of the parameters with exact gradients,
+finished by Newton steps; the Hessian is the central difference of the exact gradient.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.special import gammaln
+
+from twin_core._typing import FloatArray
+from twin_core.errors import ModelError
+from twin_core.gp.kalman import kalman_filter
+from twin_core.gp.score import score
+from twin_core.latent_force.model import ForceModel
+
+LONGEST_STEP = 1.5
+"""Largest change of ln(parameter) in one step of the climb."""
+MAX_STEPS = 60
+GAIN_LIMIT = 1e-9
+"""The climb ends when a full step promises less than this many nats."""
+DIFFERENCE = 1e-4
+"""Step of ln(parameter) for the Hessian, the cube root of the gradient's rounding."""
+BLIND_STD = 2.0
+"""Standard deviation of ln(parameter) from the data alone above which a direction is called not identifiable."""
+
+
+@dataclass(frozen=True)
+class GammaPrior:
+    """Gamma distribution, density proportional to x^(shape - 1) exp(-rate x); ``rate`` in 1/unit."""
+
+    shape: float
+    rate: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a distribution."""
+        if not (self.shape > 0 and self.rate > 0):
+            raise ModelError(f"Gamma prior: shape and rate must be positive, they are {self.shape} and {self.rate}")
+
+    def log_density(self, x: FloatArray | float) -> FloatArray:
+        """Return ln p(x)."""
+        constant = self.shape * np.log(self.rate) - gammaln(self.shape)
+        return np.asarray(constant + (self.shape - 1.0) * np.log(x) - self.rate * np.asarray(x))
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """Parameters at the maximum of the posterior.
+
+    Attributes
+    ----------
+    names
+        Of the parameters.
+    values : (n_free,)
+        At the maximum.
+    covariance : (n_free, n_free)
+        Laplace: inverse of the negative Hessian of ln p(y, values) in the values themselves (eq. 32).
+    log_covariance : (n_free, n_free)
+        The same in their logarithms, better where a posterior is wide.
+    log_likelihood, log_posterior
+        ln p(y | values), and with the prior density (not normalised by the evidence).
+    converged
+        Whether the climb ended at a maximum.
+    n_steps
+        Steps of the climb.
+    notices
+        What the data cannot tell, in words.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray
+    covariance: FloatArray
+    log_covariance: FloatArray
+    log_likelihood: float
+    log_posterior: float
+    converged: bool
+    n_steps: int
+    notices: tuple[str, ...] = ()
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations, (n_free,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def named(self) -> dict[str, float]:
+        """Return name -> value."""
+        return {name: float(value) for name, value in zip(self.names, self.values, strict=True)}
+
+
+class Posterior:
+    """ln p(y | exp(point)) + ln prior density at exp(point), over logarithms of the parameters."""
+
+    def __init__(self, model: ForceModel, observations: FloatArray, priors: Mapping[str, GammaPrior]) -> None:
+        """Take a model, samples (n_times, n_sensors), and priors by parameter name; a name without prior is flat."""
+        unknown = set(priors) - set(model.names)
+        if unknown:
+            raise ModelError(f"prior for '{sorted(unknown)[0]}': the parameters are {', '.join(model.names)}")
+        self.model, self.observations = model, observations
+        self.priors = [priors.get(name) for name in model.names]
+
+    def value(self, point: FloatArray) -> float:
+        """Return the log posterior density, -inf where the model has no likelihood."""
+        with np.errstate(over="ignore"):
+            values = np.exp(point)
+        if not np.isfinite(values).all() or not (values > 0).all():
+            return -np.inf
+        filtered = kalman_filter(self.model.linear_model(values), self.observations, keep="likelihood")
+        total = filtered.log_likelihood + self._prior(values)[0]
+        return total if np.isfinite(total) else -np.inf
+
+    def expand(self, point: FloatArray) -> tuple[float, float, FloatArray, FloatArray]:
+        """Return log posterior, log-likelihood, gradient (n_free,) and positive curvature (n_free, n_free)."""
+        values = np.exp(point)
+        found = score(self.model.linear_model(values), self.model.slopes(values), self.observations)
+        prior, gradient, curvature = self._prior(values)
+        return (
+            found.log_likelihood + prior,
+            found.log_likelihood,
+            found.gradient + gradient,
+            found.information + np.diag(curvature),
+        )
+
+    def hessian(self, point: FloatArray) -> FloatArray:
+        """Return the second derivatives in the logarithms, (n_free, n_free)."""
+        rows = []
+        for p in range(point.size):
+            shift = DIFFERENCE * np.eye(point.size)[p]
+            rows.append((self.expand(point + shift)[2] - self.expand(point - shift)[2]) / (2.0 * DIFFERENCE))
+        matrix = np.array(rows).reshape(point.size, point.size)
+        return 0.5 * (matrix + matrix.T)
+
+    def prior_curvature(self, point: FloatArray) -> FloatArray:
+        """Return minus the prior's second derivatives in the logarithms, (n_free,)."""
+        return self._prior(np.exp(point))[2]
+
+    def _prior(self, values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Return ln prior, its gradient and minus its curvature in the logarithms."""
+        total, gradient, curvature = 0.0, np.zeros(values.size), np.zeros(values.size)
+        for p, prior in enumerate(self.priors):
+            if prior is not None:
+                total += float(prior.log_density(values[p]))
+                gradient[p] = prior.shape - 1.0 - prior.rate * values[p]
+                curvature[p] = prior.rate * values[p]
+        return total, gradient, curvature
+
+
+def fit_map(
+    model: ForceModel,
+    observations: FloatArray,
+    priors: Mapping[str, GammaPrior],
+    start: Mapping[str, float] | Mapping[str, tuple[float, ...]],
+) -> MapFit:
+    """Find the parameters' maximum a posteriori and its Laplace covariance.
+
+    Parameters
+    ----------
+    model
+        Network, forces, sensors.
+    observations : (n_times, n_sensors)
+        NaN where missing.
+    priors
+        Name -> prior; names left out are flat.
+    start
+        Name -> first value, or several to be tried in all combinations (the best one is climbed).
+
+    Returns
+    -------
+    MapFit
+
+    Raises
+    ------
+    ModelError
+        A name is wrong or missing, or no starting point has a likelihood.
+    """
+    posterior = Posterior(model, observations, priors)
+    if set(start) != set(model.names):
+        raise ModelError(f"start must name the parameters {', '.join(model.names)}; it names {', '.join(start)}")
+    points = [np.log(p) for p in product(*(np.atleast_1d(start[name]) for name in model.names))]
+    ranked = [(posterior.value(p), k) for k, p in enumerate(points)] if len(points) > 1 else [(0.0, 0)]
+    best, which = max(ranked)
+    if not np.isfinite(best):
+        raise ModelError("no starting point has a finite likelihood; check units and noise")
+    point, n_steps, converged = _climb(posterior, np.asarray(points[which], dtype=np.float64))
+    return _laplace(posterior, point, n_steps, converged)
+
+
+def _climb(posterior: Posterior, point: FloatArray) -> tuple[FloatArray, int, bool]:
+    """Climb by damped scoring steps; return the point, the steps taken and whether it is a maximum."""
+    value, _, gradient, curvature = posterior.expand(point)
+    damping = 1e-3
+    for n_steps in range(1, MAX_STEPS + 1):
+        scale = np.diag(np.maximum(np.diag(curvature), 1e-6))
+        step = np.linalg.solve(curvature + damping * scale, gradient)
+        if gradient @ step < GAIN_LIMIT:
+            return point, n_steps, True
+        step *= min(1.0, LONGEST_STEP / float(np.abs(step).max()))
+        proposed = posterior.value(point + step)
+        if proposed > value:
+            point = point + step
+            damping = max(0.2 * damping, 1e-8)
+            value, _, gradient, curvature = posterior.expand(point)
+        elif damping > 1e10:
+            return point, n_steps, bool(gradient @ step < 1e-3)
+        else:
+            damping *= 10.0
+    return point, MAX_STEPS, False
+
+
+def _laplace(posterior: Posterior, point: FloatArray, n_steps: int, converged: bool) -> MapFit:
+    """Polish the maximum by Newton steps and turn the curvature there into covariances."""
+    hessian = posterior.hessian(point)
+    for _ in range(2):
+        gradient = posterior.expand(point)[2]
+        if np.linalg.eigvalsh(hessian).max() >= 0:
+            break
+        step = np.linalg.solve(-hessian, gradient)
+        if np.abs(step).max() > 0.3 or posterior.value(point + step) < posterior.value(point):
+            break
+        point = point + step
+    value, likelihood, gradient, _ = posterior.expand(point)
+    values = np.exp(point)
+    notices = _blind_directions(posterior, point, hessian)
+    curvature = (hessian - np.diag(gradient)) / np.outer(values, values)
+    names = posterior.model.names
+    if np.linalg.eigvalsh(hessian).max() >= 0:
+        notices = (*notices, "the posterior is flat or not at a maximum: no covariance")
+        blank = np.full(hessian.shape, np.nan)
+        return MapFit(names, values, blank, blank, likelihood, value, False, n_steps, notices)
+    covariance, log_covariance = (np.asarray(np.linalg.inv(-m), dtype=np.float64) for m in (curvature, hessian))
+    return MapFit(names, values, covariance, log_covariance, likelihood, value, converged, n_steps, notices)
+
+
+def _blind_directions(posterior: Posterior, point: FloatArray, hessian: FloatArray) -> tuple[str, ...]:
+    """Name the parameters that the data alone, without priors, leave open."""
+    alone = -hessian - np.diag(posterior.prior_curvature(point))
+    strengths, directions = np.linalg.eigh(alone)
+    notices = []
+    for strength, direction in zip(strengths, directions.T, strict=True):
+        if strength < BLIND_STD**-2:
+            shares = np.abs(direction) / np.abs(direction).max()
+            named = [name for name, share in zip(posterior.model.names, shares, strict=True) if share > 0.3]
+            verb = "is" if len(named) == 1 else "together are"
+            notices.append(f"{' and '.join(named)} {verb} not identifiable from these data: the prior decides")
+    return tuple(notices)

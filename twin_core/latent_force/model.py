@@ -1,0 +1,285 @@
+"""The block model of a linearised network and its latent forces: the one place for signs and ordering of states.
+
+    states   x = [T_1 ... T_n | block of force 1 | block of force 2 | ...]
+    dynamics dT/dt = J T + c + C⁻¹ (heat h x of each force into its node),   d block/dt = kernel
+    sensors  y = H T + noise
+
+Kouw et al. (CCTA 2024), eqs. 10-21, for any network, any subset of nodes and any kernel.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.errors import ModelError
+from twin_core.gp.discretise import Scheme, discretise, distinct_steps
+from twin_core.gp.kernels import Block, Kernel, Values
+from twin_core.gp.score import Slopes
+from twin_core.gp.state_space import LinearModel
+from twin_core.latent_force.linearised import Linearised
+
+STEP = 1e-30
+"""Imaginary step; its square is far below rounding, so derivatives are exact."""
+
+
+@dataclass(frozen=True)
+class Force:
+    """A latent heat into one node.
+
+    Attributes
+    ----------
+    node
+        Index of the node.
+    kernel
+        Covariance function, in W.
+    index
+        Positions of its hyperparameters in the model's vector; forces that share them share positions.
+    """
+
+    node: int
+    kernel: Kernel
+    index: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ForceModel:
+    """Network, forces and sensors over a vector of positive parameters; build it with :meth:`build`.
+
+    Attributes
+    ----------
+    names
+        Of the parameters: hyperparameters first, then the network's, then noise.
+    network
+        Called with the network's part of the vector (possibly complex); a constant network takes an empty one.
+    network_index
+        Positions of the network's parameters.
+    forces
+        Latent heats.
+    observation : (n_sensors, n_nodes)
+        H.
+    noise_std_K : (n_sensors,)
+        Where ``noise_index`` is negative.
+    noise_index : (n_sensors,)
+        Positions of estimated noise, -1 where given.
+    prior_mean_K, prior_std_K : (n_nodes,)
+        Temperatures at the first sample, before it is seen.
+    drift_K2_per_s : (n_nodes,)
+        Spectral density of white noise in dT/dt; zero unless asked.
+    scheme
+        Discretisation, exact or the paper's.
+    """
+
+    names: tuple[str, ...]
+    network: Callable[[Values], Linearised]
+    network_index: tuple[int, ...]
+    forces: tuple[Force, ...]
+    observation: FloatArray
+    noise_std_K: FloatArray
+    noise_index: IntArray
+    prior_mean_K: FloatArray
+    prior_std_K: FloatArray
+    drift_K2_per_s: FloatArray
+    scheme: Scheme = "exact"
+
+    @classmethod
+    def build(
+        cls,
+        network: Linearised | Callable[[Values], Linearised],
+        nodes: Sequence[int],
+        kernel: Kernel,
+        *,
+        observation: FloatArray,
+        noise_std_K: FloatArray,
+        prior_mean_K: FloatArray,
+        prior_std_K: FloatArray | float,
+        shared: bool = True,
+        network_names: Sequence[str] = (),
+        estimate_noise: Sequence[int] = (),
+        drift_K2_per_s: FloatArray | float = 0.0,
+        scheme: Scheme = "exact",
+    ) -> Self:
+        """Put a model together.
+
+        Parameters
+        ----------
+        network
+            Plain arrays, or a function of the values of ``network_names`` (joint estimation; it must accept complex).
+        nodes
+            Nodes that receive a force, in the order of the result.
+        kernel
+            Of every force.
+        observation : (n_sensors, n_nodes)
+        noise_std_K : (n_sensors,)
+        prior_mean_K : (n_nodes,)
+        prior_std_K : (n_nodes,) or one number
+        shared
+            One set of hyperparameters for all forces (as in the paper), or one each.
+        network_names
+            Names of the network's parameters, positive.
+        estimate_noise
+            Sensors whose noise is a parameter.
+        drift_K2_per_s : (n_nodes,) or one number
+        scheme
+            Discretisation.
+
+        Raises
+        ------
+        ModelError
+            A node or sensor does not exist, or a shape does not fit.
+        """
+        names = list(kernel.names) if shared else [f"{name}[{node}]" for node in nodes for name in kernel.names]
+        size = len(kernel.names)
+        starts = [0 if shared else k * size for k in range(len(nodes))]
+        forces = tuple(
+            Force(int(node), kernel, tuple(range(s, s + size))) for node, s in zip(nodes, starts, strict=True)
+        )
+        if not forces:
+            names = []
+        network_index = tuple(range(len(names), len(names) + len(network_names)))
+        h = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        noise_index = np.full(h.shape[0], -1, dtype=np.int64)
+        for position, sensor in enumerate(estimate_noise):
+            noise_index[sensor] = len(names) + len(network_names) + position
+        names += [*network_names, *(f"noise_std_K[{sensor}]" for sensor in estimate_noise)]
+        n = h.shape[1]
+        model = cls(
+            tuple(names),
+            (lambda values: network) if isinstance(network, Linearised) else network,
+            network_index,
+            forces,
+            h,
+            np.broadcast_to(np.asarray(noise_std_K, dtype=np.float64), (h.shape[0],)).copy(),
+            noise_index,
+            np.broadcast_to(np.asarray(prior_mean_K, dtype=np.float64), (n,)).copy(),
+            np.broadcast_to(np.asarray(prior_std_K, dtype=np.float64), (n,)).copy(),
+            np.broadcast_to(np.asarray(drift_K2_per_s, dtype=np.float64), (n,)).copy(),
+            scheme,
+        )
+        for node in nodes:
+            if not 0 <= node < n:
+                raise ModelError(f"force on node {node}: the network has nodes 0 to {n - 1}")
+        return model
+
+    @property
+    def n_nodes(self) -> int:
+        """Number of nodes, the first states."""
+        return int(self.observation.shape[1])
+
+    def blocks(self, values: Values) -> list[Block]:
+        """Return each force's differential equation at parameters (n_free,)."""
+        return [force.kernel.block(values[list(force.index)]) for force in self.forces]
+
+    def force_rows(self, values: FloatArray) -> FloatArray:
+        """Return the rows that read each force out of the state, (n_forces, n_states)."""
+        blocks = self.blocks(np.asarray(values, dtype=np.float64))
+        n_states = self.n_nodes + sum(b.observation.size for b in blocks)
+        rows, at = np.zeros((len(blocks), n_states)), self.n_nodes
+        for k, block in enumerate(blocks):
+            rows[k, at : at + block.observation.size] = block.observation
+            at += block.observation.size
+        return rows
+
+    def linear_model(self, values: FloatArray) -> LinearModel:
+        """Return the discrete model at parameters (n_free,)."""
+        at = np.asarray(values, dtype=np.float64)
+        network = self.network(at[list(self.network_index)])
+        steps, index = step_table(network)
+        moved = [np.asarray(np.real(a), dtype=np.float64) for a in self._assemble(at, network, steps, index)]
+        observation = np.hstack([self.observation, np.zeros((self.observation.shape[0], moved[4].size - self.n_nodes))])
+        return LinearModel.build(
+            transition=moved[0],
+            process_cov=moved[1],
+            offset=moved[2],
+            noise_variance=moved[3],
+            prior_mean=moved[4],
+            prior_cov=moved[5],
+            observation=observation,
+            step_index=index,
+            n_times=network.time_s.size,
+        )
+
+    def slopes(self, values: FloatArray) -> Slopes:
+        """Return the exact derivatives of the discrete model in the logarithms of the parameters."""
+        columns = []
+        for p in range(len(self.names)):
+            moved = np.array(values, dtype=np.complex128)
+            moved[p] *= 1.0 + 1j * STEP
+            network = self.network(moved[list(self.network_index)])
+            steps, index = step_table(network)
+            columns.append([np.imag(a) / STEP for a in self._assemble(moved, network, steps, index)])
+        return Slopes(*(np.ascontiguousarray(np.stack(arrays)) for arrays in zip(*columns, strict=True)))
+
+    def _assemble(self, values: Values, network: Linearised, steps: FloatArray, index: IntArray) -> tuple[Values, ...]:
+        """Return transition, process_cov, offset, noise_variance, prior_mean, prior_cov; complex where values are."""
+        blocks, n = self.blocks(values), self.n_nodes
+        feedback, diffusion = augment(network, self.forces, blocks, self.drift_K2_per_s)
+        discrete = discretise(feedback, diffusion, steps, scheme=self.scheme)
+        offset = drive(discrete.hold[:, :, :n], discrete.ramp[:, :, :n], index, network.constant_K_per_s)
+        noise = self.noise_std_K.astype(values.dtype)
+        estimated = self.noise_index >= 0
+        noise[estimated] = values[self.noise_index[estimated]]
+        n_states = feedback.shape[-1]
+        mean, cov = np.zeros(n_states), np.zeros((n_states, n_states), dtype=values.dtype)
+        mean[:n] = self.prior_mean_K
+        cov[range(n), range(n)] = self.prior_std_K**2
+        at = n
+        for block in blocks:
+            size = block.observation.size
+            cov[at : at + size, at : at + size] = block.stationary_cov
+            at += size
+        return discrete.transition, discrete.process_cov, offset, noise**2, mean, cov
+
+
+def step_table(network: Linearised) -> tuple[FloatArray, IntArray]:
+    """Return the steps to be discretised and which of them each step uses: few where the network is linear."""
+    steps, index = distinct_steps(network.time_s)
+    if network.jacobian_per_s.shape[0] == 1 and network.capacity_J_per_K.shape[0] == 1:
+        return steps, index
+    return steps[index] if index.size else steps, np.arange(index.size, dtype=np.int64)
+
+
+def augment(
+    network: Linearised, forces: Sequence[Force], blocks: Sequence[Block], drift_K2_per_s: FloatArray
+) -> tuple[Values, Values]:
+    """Return F (1 or n_steps, n_states, n_states) and D (n_states, n_states): heat h x / C enters its node, positive."""
+    n = network.n_nodes
+    n_states = n + sum(b.observation.size for b in blocks)
+    count = max(network.jacobian_per_s.shape[0], network.capacity_J_per_K.shape[0])
+    kind = np.result_type(network.jacobian_per_s, network.capacity_J_per_K, *(b.feedback for b in blocks))
+    feedback, diffusion = np.zeros((count, n_states, n_states), dtype=kind), np.zeros((n_states, n_states), dtype=kind)
+    feedback[:, :n, :n] = network.jacobian_per_s
+    diffusion[range(n), range(n)] = drift_K2_per_s
+    at = n
+    for force, block in zip(forces, blocks, strict=True):
+        here = slice(at, at + block.observation.size)
+        feedback[:, force.node, here] = block.observation / network.capacity_J_per_K[:, force.node, None]
+        feedback[:, here, here] = block.feedback
+        diffusion[here, here] = block.diffusion
+        at = here.stop
+    return feedback, diffusion
+
+
+def drive(hold: Values, ramp: Values, index: IntArray, inputs: Values) -> Values:
+    """Return hold u_start + ramp (u_end - u_start) of each step.
+
+    Parameters
+    ----------
+    hold, ramp : (n_distinct, n_states, n_inputs)
+    index : (n_steps,)
+    inputs : (n_steps, 2, n_inputs)
+
+    Returns
+    -------
+    (n_steps, n_states)
+    """
+    start, rise = inputs[:, 0], inputs[:, 1] - inputs[:, 0]
+    if hold.shape[0] == index.size:
+        return np.einsum("kij,kj->ki", hold, start) + np.einsum("kij,kj->ki", ramp, rise)
+    out = np.zeros((index.size, hold.shape[1]), dtype=np.result_type(hold, inputs))
+    for d in range(hold.shape[0]):
+        here = index == d
+        out[here] = start[here] @ hold[d].T + rise[here] @ ramp[d].T
+    return out

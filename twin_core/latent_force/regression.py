@@ -1,0 +1,278 @@
+"""The heat as a polynomial of temperature, learned from the samples themselves under the model's full covariance.
+
+Smoothed forces are strongly correlated in time, so fitting a curve through them as if they were independent gives a band
+that is far too narrow. Here the weights enter the heat balance: y = network + sum_j w_j (response to term j along the
+smoothed temperatures) + latent force as the misfit + noise. One filter whitens samples and responses together, so that
+every degree, and every combination of degrees over the forces, is a small ridge regression with an exact evidence.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.special import logsumexp
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.errors import ModelError
+from twin_core.gp.columns import WhiteRegression, whiten_responses
+from twin_core.gp.discretise import discretise
+from twin_core.latent_force.model import ForceModel, augment, drive, step_table
+from twin_core.latent_force.polynomial import Basis, ForcePolynomial
+from twin_core.latent_force.smooth import LatentForce
+
+MISFIT_SHARES = (1e-4, 1e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0)
+"""Misfits tried, as shares of the latent force's own standard deviation."""
+EXHAUSTIVE = 300
+"""Combinations of degrees up to which all are tried."""
+
+
+@dataclass(frozen=True)
+class LearnedHeatFlow:
+    """Polynomials of all forces, learned together.
+
+    Attributes
+    ----------
+    polynomials
+        One per force.
+    degrees
+        Theirs.
+    misfit_W : (n_forces,)
+        Standard deviation of the heat that is left beside the polynomial, averaged over the misfits tried.
+    log_evidence
+        ln p(y | degrees).
+    evidence_by_degree
+        Degree common to all forces -> ln evidence.
+    """
+
+    polynomials: tuple[ForcePolynomial, ...]
+    degrees: tuple[int, ...]
+    misfit_W: FloatArray
+    log_evidence: float
+    evidence_by_degree: dict[int, float]
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """Posterior of the weights for one combination of degrees; ``kept`` are their columns."""
+
+    kept: IntArray
+    mean: FloatArray
+    cov: FloatArray
+    log_evidence: float
+    misfit_W: FloatArray
+
+
+def learn_heat_flow(
+    model: ForceModel,
+    observations: FloatArray,
+    values: FloatArray,
+    smoothed: LatentForce,
+    *,
+    max_degree: int = 5,
+    degree: int | None = None,
+    boundary_K: FloatArray | None = None,
+    vanishing: bool | None = None,
+) -> LearnedHeatFlow:
+    """Learn each force as a polynomial of its node's temperature.
+
+    Parameters
+    ----------
+    model
+        Network, forces, sensors; its kernel becomes that of the misfit.
+    observations : (n_times, n_sensors)
+        NaN where missing.
+    values : (n_free,)
+        Parameters, as fitted; the forces' ``std`` is scaled down to what the polynomial leaves.
+    smoothed
+        Temperatures along which the terms are evaluated.
+    max_degree
+        Highest degree tried.
+    degree
+        One degree for all forces instead of the evidence's choice.
+    boundary_K : (n_times,), optional
+        Boundary temperature, a second variable.
+    vanishing
+        Whether the heat is a polynomial of the difference to the boundary that vanishes with it. By default the
+        evidence decides where a boundary is given.
+
+    Raises
+    ------
+    ModelError
+        The model has no force, or a shape does not fit.
+    """
+    if not model.forces:
+        raise ModelError("the model has no latent force to learn a heat flow from")
+    forms = [vanishing] if vanishing is not None else [False] if boundary_K is None else [False, True]
+    learned = [
+        _learn(model, observations, values, smoothed, _Range(max_degree, degree, boundary_K, form)) for form in forms
+    ]
+    return max(learned, key=lambda found: found.log_evidence)
+
+
+@dataclass(frozen=True)
+class _Range:
+    """What may be learned: degrees, second variable, form."""
+
+    max_degree: int
+    degree: int | None
+    boundary_K: FloatArray | None
+    vanishing: bool
+
+    @property
+    def degrees(self) -> range:
+        """Degrees tried."""
+        lowest = int(self.vanishing)
+        return range(lowest, self.max_degree + 1) if self.degree is None else range(self.degree, self.degree + 1)
+
+
+def _learn(
+    model: ForceModel, observations: FloatArray, values: FloatArray, smoothed: LatentForce, allowed: _Range
+) -> LearnedHeatFlow:
+    """Learn within one form of basis: misfit and degrees by evidence."""
+    bases = [
+        Basis.over(
+            allowed.degrees[-1], smoothed.temperature_K[:, f.node], allowed.boundary_K, vanishing=allowed.vanishing
+        )
+        for f in model.forces
+    ]
+    prior_std_W = np.maximum(_scales(model, values), np.sqrt(np.mean(smoothed.mean_W**2, axis=0)))
+    offsets = _responses(model, values, smoothed, bases, allowed.boundary_K)
+    problems = []
+    for share in MISFIT_SHARES:
+        white = whiten_responses(model.linear_model(_shrink(model, values, share)), observations, offsets)
+        problems.append(_Problem.of(white, bases, prior_std_W))
+    family = _Family(tuple(problems), np.outer(MISFIT_SHARES, _scales(model, values)))
+    degrees = family.choose(allowed.degrees)
+    choice = family.solve(degrees)
+    return LearnedHeatFlow(
+        tuple(_polynomial(k, basis, choice, problems[0].owner) for k, basis in enumerate(bases)),
+        degrees,
+        choice.misfit_W,
+        choice.log_evidence,
+        {d: family.log_evidence((d,) * len(bases)) for d in allowed.degrees},
+    )
+
+
+def _scales(model: ForceModel, values: FloatArray) -> FloatArray:
+    """Return the stationary standard deviation of each force, (n_forces,)."""
+    blocks = model.blocks(np.asarray(values, dtype=np.float64))
+    return np.array([np.sqrt(np.real(b.observation @ b.stationary_cov @ b.observation)) for b in blocks])
+
+
+def _shrink(model: ForceModel, values: FloatArray, share: float) -> FloatArray:
+    """Return the parameters with every standard deviation of a force scaled."""
+    shrunk = np.array(values, dtype=np.float64)
+    scaled = {i for f in model.forces for i, name in zip(f.index, f.kernel.names, strict=True) if name[:3] == "std"}
+    shrunk[sorted(scaled)] *= share
+    return shrunk
+
+
+def _responses(
+    model: ForceModel,
+    values: FloatArray,
+    smoothed: LatentForce,
+    bases: list[Basis],
+    boundary_K: FloatArray | None,
+) -> FloatArray:
+    """Return what a weight of one adds to the offset, (n_columns, n_steps, n_states): heat over capacity into the node."""
+    at = np.asarray(values, dtype=np.float64)
+    network = model.network(at[list(model.network_index)])
+    feedback, diffusion = augment(network, model.forces, model.blocks(at), model.drift_K2_per_s)
+    steps, index = step_table(network)
+    discrete = discretise(np.real(feedback), np.real(diffusion), steps)
+    capacity = np.broadcast_to(network.capacity_J_per_K, (index.size, model.n_nodes))
+    columns = []
+    for force, basis in zip(model.forces, bases, strict=True):
+        node = force.node
+        terms = basis.terms(smoothed.temperature_K[:, node], boundary_K, smoothed.temperature_std_K[:, node])
+        into = slice(node, node + 1)
+        for term in terms.T:
+            ends = (np.stack([term[:-1], term[1:]], axis=1) / capacity[:, node, None])[:, :, None]
+            columns.append(drive(discrete.hold[:, :, into], discrete.ramp[:, :, into], index, ends))
+    return np.array(columns)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The white regression over all terms of all forces.
+
+    ``owner`` and ``order`` (n_columns,) tell each column's force and total degree; ``scale_W`` its prior deviation.
+    """
+
+    white: WhiteRegression
+    owner: IntArray
+    order: IntArray
+    scale_W: FloatArray
+    gram: FloatArray
+    moment: FloatArray
+
+    @classmethod
+    def of(cls, white: WhiteRegression, bases: list[Basis], prior_std_W: FloatArray) -> "_Problem":
+        """Form the normal equations once, in units of the prior."""
+        owner = np.concatenate([np.full(len(b.exponents), k) for k, b in enumerate(bases)])
+        order = np.array([sum(e) for b in bases for e in b.exponents], dtype=np.int64)
+        columns = white.columns * prior_std_W[owner]
+        return cls(white, owner, order, prior_std_W[owner], columns.T @ columns, columns.T @ white.target)
+
+    def solve(self, degrees: tuple[int, ...]) -> _Choice:
+        """Ridge regression on the terms up to each force's degree, with its exact evidence."""
+        kept = np.flatnonzero(self.order <= np.asarray(degrees)[self.owner])
+        lower = np.linalg.cholesky(self.gram[np.ix_(kept, kept)] + np.eye(kept.size))
+        inverse = np.linalg.inv(lower)
+        right = inverse @ self.moment[kept]
+        log_evidence = self.white.log_likelihood + 0.5 * float(right @ right) - float(np.log(np.diag(lower)).sum())
+        scale = self.scale_W[kept]
+        cov = (inverse.T @ inverse) * np.outer(scale, scale)
+        return _Choice(kept, scale * (inverse.T @ right), cov, log_evidence, np.zeros(0))
+
+
+@dataclass(frozen=True)
+class _Family:
+    """One problem per misfit, all equally likely a priori; what is learned is their average.
+
+    ``misfits_W`` is (n_problems, n_forces).
+    """
+
+    problems: tuple[_Problem, ...]
+    misfits_W: FloatArray
+
+    def log_evidence(self, degrees: tuple[int, ...]) -> float:
+        """Return ln p(y | degrees), averaged over the misfits."""
+        each = [problem.solve(degrees).log_evidence for problem in self.problems]
+        return float(logsumexp(each) - np.log(len(each)))
+
+    def choose(self, degrees: range) -> tuple[int, ...]:
+        """Return the combination of degrees of the highest evidence."""
+        n_forces = self.misfits_W.shape[1]
+        if len(degrees) ** n_forces <= EXHAUSTIVE:
+            return max(product(degrees, repeat=n_forces), key=self.log_evidence)
+        best = max(((d,) * n_forces for d in degrees), key=self.log_evidence)
+        value, improved = self.log_evidence(best), True
+        while improved:
+            improved = False
+            for k, d in product(range(n_forces), degrees):
+                other = (*best[:k], d, *best[k + 1 :])
+                if self.log_evidence(other) > value + 1e-9:
+                    best, value, improved = other, self.log_evidence(other), True
+        return best
+
+    def solve(self, degrees: tuple[int, ...]) -> _Choice:
+        """Return mean and covariance of the weights under the mixture over misfits."""
+        each = [problem.solve(degrees) for problem in self.problems]
+        evidence = np.array([choice.log_evidence for choice in each])
+        total = float(logsumexp(evidence))
+        shares = np.exp(evidence - total)
+        means = np.array([choice.mean for choice in each])
+        mean = shares @ means
+        away = means - mean
+        cov = np.tensordot(shares, [choice.cov for choice in each], 1) + (away.T * shares) @ away
+        misfit = np.sqrt(shares @ self.misfits_W**2)
+        return _Choice(each[0].kept, mean, cov, total - float(np.log(len(each))), misfit)
+
+
+def _polynomial(k: int, basis: Basis, choice: _Choice, owner: IntArray) -> ForcePolynomial:
+    """Cut one force out of the joint posterior."""
+    own = np.flatnonzero(owner[choice.kept] == k)
+    short = replace(basis, exponents=tuple(basis.exponents[: own.size]))
+    cov = choice.cov[np.ix_(own, own)]
+    return ForcePolynomial(short, choice.mean[own], cov, float(choice.misfit_W[k]), choice.log_evidence)
