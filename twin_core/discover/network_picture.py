@@ -13,6 +13,7 @@ from twin_core.discover.phrasing import in_words, number
 WIDTH, HEIGHT, MARGIN = 900.0, 400.0, 64.0
 _LABEL_ROOM = 70.0
 _LONGEST = 24
+_EFFECT_BEND = -26.0
 _STEPS = 200
 
 
@@ -40,6 +41,7 @@ def draw_network(network: Mapping[str, Any]) -> str:
     parts += [_line(at, node, sink, "radiator", "", bend=18.0) for node, sink in radiators]
     parts += [_effect(at, effect) for effect in effects]
     parts += [_box(at, name) for name in boundaries] + [_disc(at, name) for name in nodes]
+    parts += [_effect_label(at, effect) for effect in effects]
     label = f"Thermal network of {len(nodes)} nodes"
     return f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
 
@@ -105,25 +107,40 @@ def _line(at: Mapping[str, tuple[float, float]], a: str, b: str, kind: str, labe
     if a not in at or b not in at:
         return ""
     (x0, y0), (x1, y1) = at[a], at[b]
-    length = math.hypot(x1 - x0, y1 - y0) or 1.0
-    across = (-(y1 - y0) / length * bend, (x1 - x0) / length * bend)
-    middle = ((x0 + x1) / 2 + across[0], (y0 + y1) / 2 + across[1])
-    control = (middle[0] + across[0], middle[1] + across[1])
+    middle, control = _bow(at[a], at[b], bend)
     curve = f'<path class="{kind}" d="M{x0:.1f} {y0:.1f}Q{control[0]:.1f} {control[1]:.1f} {x1:.1f} {y1:.1f}"/>'
     beside = (middle[0] - 0.08 * (x1 - x0), middle[1] - 0.08 * (y1 - y0))  # lines often cross at their middles
     return curve + (_text(beside, label, f"{kind}-label", -5.0) if label else "")
 
 
+def _bow(
+    start: tuple[float, float], stop: tuple[float, float], bend: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the middle of a curve that bends so many pixels aside, and its control point."""
+    (x0, y0), (x1, y1) = start, stop
+    length = math.hypot(x1 - x0, y1 - y0) or 1.0
+    across = (-(y1 - y0) / length * bend, (x1 - x0) / length * bend)
+    middle = ((x0 + x1) / 2 + across[0], (y0 + y1) / 2 + across[1])
+    return middle, (middle[0] + across[0], middle[1] + across[1])
+
+
 def _effect(at: Mapping[str, tuple[float, float]], effect: Mapping[str, Any]) -> str:
     """Return an effect: a curve between two places, or a ring around one; one of a channel is not drawn."""
-    name, where = in_words(str(effect.get("effect"))), effect.get("where") or {}
     ends = _ends(effect)
     if ends is not None:
-        return _line(at, *ends, "effect", name, bend=-26.0)
-    node = str(where.get("node"))
-    if node not in at:
-        return ""
-    return _pill(at[node], node, "effect", 8.0) + _text(at[node], name, "effect-label", -34.0)
+        return _line(at, *ends, "effect", "", bend=_EFFECT_BEND)
+    node = str((effect.get("where") or {}).get("node"))
+    return _pill(at[node], node, "effect", 8.0) if node in at else ""
+
+
+def _effect_label(at: Mapping[str, tuple[float, float]], effect: Mapping[str, Any]) -> str:
+    """Return the effect's name, at the middle of its curve or above its ring."""
+    name, ends = in_words(str(effect.get("effect"))), _ends(effect)
+    if ends is not None and ends[0] in at and ends[1] in at:
+        spot, _ = _bow(at[ends[0]], at[ends[1]], _EFFECT_BEND)
+        return _text(spot, name, "effect-label", 4.0)
+    node = str((effect.get("where") or {}).get("node"))
+    return _text(at[node], name, "effect-label", -34.0) if ends is None and node in at else ""
 
 
 def _disc(at: Mapping[str, tuple[float, float]], name: str) -> str:
