@@ -8,6 +8,7 @@ import pytest
 
 from service.app import create_app
 from service.settings import read_settings
+from service.workbench import CoreWorkbench
 from tests.service.harness import AppClient
 
 SPEC: dict[str, Any] = {
@@ -40,9 +41,9 @@ def make_client(tmp_path: Path) -> Iterator[MakeClient]:
     """Return a function that starts a service on the test's database; all are stopped at the end."""
     opened: list[AppClient] = []
 
-    def make(**settings: Any) -> AppClient:
+    def make(workbench: Any = CoreWorkbench, **settings: Any) -> AppClient:
         url = f"sqlite:///{tmp_path / 'twin.sqlite3'}"
-        client = AppClient(create_app(read_settings(**{"database_url": url, **settings})))
+        client = AppClient(create_app(read_settings(**{"database_url": url, **settings}), workbench=workbench))
         opened.append(client)
         return client
 

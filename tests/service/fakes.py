@@ -1,0 +1,95 @@
+"""A workbench that answers at once, for tests of everything around the science."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from service.workbench import (
+    CalibrationTask,
+    DiagnosisTask,
+    Filtered,
+    Forecasted,
+    ForecastTask,
+    Json,
+    Outcome,
+    Progress,
+    Telemetry,
+)
+from twin_core.errors import ModelError
+
+SENSORS = ("T_px", "T_tank")
+
+
+class FakeWorkbench:
+    """Calibrates to a given error, crashes or dawdles when a channel says so.
+
+    The mean of ``Q_px`` chooses what a calibration does: 13 dies, 14 raises, 15 refuses, 16 runs for ever, anything
+    else is the RMSE in K that the new model claims on recent data.
+    """
+
+    def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
+        progress(0.3, "warming up")
+        wish = float(np.nanmean(task.telemetry.values["Q_px"][-20:]))
+        if wish == 13:
+            os.kill(os.getpid(), 9)
+        if wish == 14:
+            raise ZeroDivisionError("unexpected")
+        if wish == 15:
+            raise ModelError("the balance has no solution")
+        while wish == 16:
+            progress(0.5, "at it")
+            time.sleep(0.02)
+        train = task.telemetry.before(task.validation_us)
+        rival = None if task.rival is None else float(task.rival["rmse_K"])
+        return _outcome(task.specification, wish, rival, int(train.time_us.size), int(train.time_us[-1]))
+
+    def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
+        progress(0.5, "searching")
+        wish = float(np.nanmean(task.telemetry.values["Q_px"][-20:]))
+        made = _outcome(
+            task.specification, 0.1, None, int(task.telemetry.time_us.size), int(task.telemetry.time_us[-1])
+        )
+        finding = {"effect": "constant_heat_load", "where": {"node": "px"}, "parameters": {}}
+        report = {"twin": "benchsat", "verdict": "effect_added", "findings": [finding], "train": made.train}
+        if wish == 0:
+            report |= {"verdict": "no_effect_supported", "findings": []}
+        report |= {"holdout_share": task.holdout}
+        effects = [finding] if wish else []
+        return Outcome(made.document, made.train, made.validation, effects, report=report, page="<h1>found</h1>")
+
+    def inspect(self, document: Json) -> Outcome:
+        if "spec" not in document:
+            raise ModelError("spec: is missing")
+        return Outcome(document, {}, {"rmse_K": 1.0}, [])
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        """Predict that nothing changes: innovations are first differences, the state the last readings."""
+        if "poison" in document and not Path(document[document.index("/") :].split('"')[0]).exists():
+            os.kill(os.getpid(), 9)
+        read = np.stack([telemetry.values[s] for s in SENSORS], axis=1)
+        before = np.array(state["last"]) if state else read[0]
+        before = np.where(np.isnan(before), 0.0, before)
+        innovation = np.diff(read, axis=0, prepend=before[None, :])
+        last = np.where(np.isnan(read[-1]), before, read[-1])
+        nis = np.nansum(innovation**2, axis=1)
+        return Filtered(SENSORS, innovation, np.ones_like(innovation), nis, {"last": last.tolist()})
+
+    def forecast(self, document: str, task: ForecastTask) -> Forecasted:
+        """Hold the last readings; the planned power, if there is one, is added to them."""
+        assert task.step_s is not None and task.state is not None
+        count = round(task.horizon_s / task.step_s)
+        start = int(task.telemetry.time_us[-1])
+        time_us = start + np.arange(1, count + 1) * round(task.step_s * 1e6)
+        planned = 0.0 if task.plan is None else task.plan.values["Q_px"][-1]
+        mean = {s: np.full(count, last + planned) for s, last in zip(SENSORS, task.state["last"], strict=True)}
+        quantiles = {q: {s: m + q - 0.5 for s, m in mean.items()} for q in task.quantiles}
+        return Forecasted(time_us, mean, quantiles)
+
+
+def _outcome(specification: Json, rmse_K: float, rival: float | None, samples: int, stop_us: int) -> Outcome:
+    stop = f"{np.datetime64(stop_us, 'us')}Z"
+    train = {"start": "1970-01-01T00:00:00Z", "stop": stop, "samples": samples}
+    document = {"spec": specification, "rmse_K": rmse_K, "max_step_s": 60.0}
+    return Outcome(document, train, {"rmse_K": rmse_K}, [], rival)

@@ -1,0 +1,210 @@
+"""Calibrations and diagnoses as jobs, and the model versions that they leave."""
+
+import time
+from typing import Any
+
+import pytest
+
+from tests.service.conftest import SPEC
+from tests.service.fakes import FakeWorkbench
+from tests.service.harness import AppClient
+
+TWIN = "/v1/twins/benchsat"
+
+
+@pytest.fixture
+def client(make_client) -> AppClient:
+    client = make_client(workbench=FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    return client
+
+
+def feed(client: AppClient, wish: float, first: int = 0, count: int = 120) -> None:
+    """Send samples whose power tells the fake workbench what to do."""
+    time_s = list(range(first, first + count))
+    body = {"time": time_s, "values": {"T_px": [290.0] * count, "T_tank": [1.0] * count, "Q_px": [wish] * count}}
+    assert client.post(f"{TWIN}/telemetry", json=body).json()["accepted"] == count
+
+
+def start(client: AppClient, room: str = "calibrations", **request: Any) -> str:
+    response = client.post(f"{TWIN}/{room}", json=request)
+    assert response.status_code == 202, response.text
+    job = response.json()
+    assert job["state"] == "queued"
+    assert response.headers["location"] == f"{TWIN}/{room}/{job['id']}"
+    return response.headers["location"]
+
+
+def finish(client: AppClient, path: str) -> dict:
+    for _ in range(1500):
+        job = client.get(path).json()
+        if job["state"] not in ("queued", "running"):
+            return job
+        time.sleep(0.02)
+    raise AssertionError(f"{path} does not end: {job}")
+
+
+def test_first_calibration_becomes_active_with_provenance(client: AppClient) -> None:
+    feed(client, 0.5)
+    job = finish(client, start(client))
+    assert (job["kind"], job["state"], job["progress"]) == ("calibration", "succeeded", 1.0)
+    assert (job["result"]["model_version"], job["result"]["activated"]) == (1, True)
+    assert job["created"] <= job["started"] <= job["finished"]
+    models = client.get(f"{TWIN}/models").json()
+    (model,) = models["models"]
+    assert (model["version"], model["active"], model["source"]) == (1, True, "calibration")
+    assert model["validation"]["rmse_K"] == 0.5
+    assert model["train"]["samples"] == 96  # the last fifth is held back
+    assert len(model["provenance"]["data_sha256"]) == 64
+    assert model["provenance"]["code_version"]
+    assert models["activations"][0]["reason"] == "the first model"
+    assert client.get(f"{TWIN}/models/1").json()["model"]["spec"]["twin"] == "benchsat"
+    assert client.get(TWIN).json()["active_model"] == 1
+
+
+@pytest.mark.parametrize(("claim", "wins"), [(0.4, True), (0.6, False)])
+def test_a_later_model_must_beat_the_active_one(client: AppClient, claim: float, wins: bool) -> None:
+    feed(client, 0.5)
+    finish(client, start(client))
+    feed(client, claim, first=1000)
+    result = finish(client, start(client))["result"]
+    assert result["activated"] is wins
+    assert result["rival_rmse_K"] == 0.5
+    assert [m["active"] for m in client.get(f"{TWIN}/models").json()["models"]] == [not wins, wins]
+
+
+def test_without_new_data_nothing_can_be_beaten(client: AppClient) -> None:
+    feed(client, 0.5)
+    finish(client, start(client))
+    feed(client, 0.1, first=1000, count=20)
+    finish(client, start(client, activate=True))
+    result = finish(client, start(client))["result"]
+    assert result["model_version"] == 3 and not result["activated"]
+
+
+def test_roll_back(client: AppClient) -> None:
+    feed(client, 0.5)
+    finish(client, start(client))
+    finish(client, start(client, activate=True))
+    assert client.get(TWIN).json()["active_model"] == 2
+    assert client.post(f"{TWIN}/models/1/activate").json()["active"] is True
+    assert client.get(TWIN).json()["active_model"] == 1
+    assert client.post(f"{TWIN}/models/9/activate").status_code == 404
+
+
+def test_diagnosis_leaves_a_report_and_an_inactive_version(client: AppClient) -> None:
+    feed(client, 1.0)
+    path = start(client, "diagnoses", holdout=0.25)
+    job = finish(client, path)
+    assert job["result"]["verdict"] == "effect_added"
+    assert job["result"]["holdout_share"] == 0.25
+    assert (job["result"]["model_version"], job["result"]["activated"]) == (1, False)
+    page = client.get(f"{path}/report.html")
+    assert page.headers["content-type"].startswith("text/html") and "found" in page.text
+    model = client.get(f"{TWIN}/models/1").json()
+    assert (model["source"], model["active"]) == ("diagnosis", False)
+    assert model["effects"][0]["effect"] == "constant_heat_load"
+
+
+def test_diagnosis_can_activate_and_finding_nothing_makes_no_version(client: AppClient) -> None:
+    feed(client, 1.0)
+    assert finish(client, start(client, "diagnoses", activate=True))["result"]["activated"] is True
+    feed(client, 0.0, first=1000)
+    result = finish(client, start(client, "diagnoses", activate=True))["result"]
+    assert (result["verdict"], result["model_version"]) == ("no_effect_supported", None)
+    assert len(client.get(f"{TWIN}/models").json()["models"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("wish", "message"),
+    [
+        (13, "its worker process died (SIGKILL)"),
+        (14, "ZeroDivisionError: unexpected"),
+        (15, "the balance has no solution"),
+    ],
+)
+def test_a_job_that_goes_wrong_harms_nothing_else(client: AppClient, wish: float, message: str) -> None:
+    feed(client, wish)
+    job = finish(client, start(client))
+    assert job["state"] == "failed" and message in job["message"]
+    assert client.get(f"{TWIN}/models").json()["models"] == []
+    feed(client, 0.5, first=1000)
+    assert finish(client, start(client))["state"] == "succeeded"
+
+
+def test_cancel_ends_a_running_job(client: AppClient) -> None:
+    feed(client, 16)
+    path = start(client)
+    while client.get(path).json()["progress"] < 0.5:
+        time.sleep(0.02)
+    waiting = start(client, "diagnoses")
+    assert client.get(waiting).json()["state"] == "queued"
+    assert client.delete(waiting).json()["state"] == "cancelled"
+    assert client.delete(path).json()["state"] == "cancelled"
+    assert client.delete(path).json()["state"] == "cancelled"
+    feed(client, 0.5, first=1000)
+    assert finish(client, start(client))["state"] == "succeeded"
+
+
+def test_deadline(make_client) -> None:
+    client = make_client(workbench=FakeWorkbench, job_deadline_s=2.0)
+    client.post("/v1/twins", json=SPEC)
+    feed(client, 16)
+    job = finish(client, start(client))
+    assert job["state"] == "failed" and "TWIN_JOB_DEADLINE_S" in job["message"]
+
+
+def test_stopping_the_service_ends_jobs_and_the_next_start_says_so(make_client) -> None:
+    client = make_client(workbench=FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    feed(client, 16)
+    path = start(client)
+    client.close()
+    again = make_client(workbench=FakeWorkbench)
+    assert again.get(path).json()["state"] == "cancelled"
+
+
+def test_deleting_a_twin_ends_its_jobs(client: AppClient) -> None:
+    feed(client, 16)
+    path = start(client)
+    assert client.delete(TWIN).status_code == 204
+    assert client.get(path).status_code == 404
+
+
+@pytest.mark.parametrize(
+    ("room", "request_body", "field"),
+    [
+        ("calibrations", {"method": "magic"}, "method"),
+        ("calibrations", {"start": "noon"}, "start"),
+        ("calibrations", {"start": 20, "stop": 10}, "stop"),
+        ("calibrations", {"speed": 1}, "speed"),
+        ("diagnoses", {"holdout": 1.5}, "holdout"),
+        ("diagnoses", {"holdout": True}, "holdout"),
+        ("diagnoses", {"burn_in_s": -1}, "burn_in_s"),
+        ("diagnoses", {"activate": "perhaps"}, "activate"),
+        ("diagnoses", [], "body"),
+    ],
+)
+def test_wrong_requests_start_nothing(client: AppClient, room: str, request_body: Any, field: str) -> None:
+    feed(client, 0.5)
+    response = client.post(f"{TWIN}/{room}", json=request_body)
+    assert response.status_code == 422
+    assert response.headers["content-type"] == "application/problem+json"
+    assert field in response.json()["detail"]
+    assert client.get(f"{TWIN}/{room}").json() == {"jobs": []}
+
+
+def test_a_job_needs_telemetry_and_a_body_is_optional(client: AppClient) -> None:
+    assert client.post(f"{TWIN}/calibrations").status_code == 422
+    feed(client, 0.5)
+    assert client.post(f"{TWIN}/calibrations").status_code == 202
+    assert client.get(f"{TWIN}/calibrations/nosuch").status_code == 404
+    assert client.get(f"{TWIN}/diagnoses/nosuch/report.html").status_code == 404
+
+
+def test_a_model_made_elsewhere(client: AppClient) -> None:
+    response = client.post(f"{TWIN}/models", json={"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0})
+    assert response.status_code == 201
+    assert (response.json()["source"], response.json()["active"]) == ("manual", False)
+    assert client.post(f"{TWIN}/models", json={"spec": {**SPEC, "twin": "other"}}).status_code == 422
+    assert client.post(f"{TWIN}/models", json={}).status_code == 422

@@ -1,0 +1,146 @@
+"""The live state: residuals, anomalies and forecasts after each sample, late ones included."""
+
+import time
+
+import numpy as np
+import pytest
+
+from tests.service.conftest import SPEC
+from tests.service.fakes import FakeWorkbench
+from tests.service.harness import AppClient
+
+TWIN = "/v1/twins/benchsat"
+
+
+@pytest.fixture
+def client(make_client) -> AppClient:
+    client = make_client(workbench=FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    return client
+
+
+def send(client: AppClient, time_s: list[float], T_px: list[float | None], **more: list) -> None:
+    values = {"T_px": T_px, "T_tank": [0.0] * len(time_s), "Q_px": [0.5] * len(time_s), **more}
+    assert client.post(f"{TWIN}/telemetry", json={"time": time_s, "values": values}).status_code == 200
+
+
+def calibrate(client: AppClient) -> None:
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    assert client.get(path).json()["state"] == "succeeded"
+
+
+def squares(client: AppClient) -> dict[str, float]:
+    """Ramp of squares at 0..99 s, the model calibrated on them; return residuals by time."""
+    send(client, list(range(100)), [float(k * k) for k in range(100)])
+    calibrate(client)
+    return residuals(client)
+
+
+def residuals(client: AppClient, **parameters: str | int) -> dict[str, float]:
+    found = client.get(f"{TWIN}/residuals", params=parameters).json()
+    assert set(found["residual_K"]) == {"T_px", "T_tank"}
+    assert len(found["time"]) == len(found["nis"]) == len(found["model_version"])
+    return dict(zip(found["time"], found["residual_K"]["T_px"], strict=True))
+
+
+def test_the_archive_is_assimilated_when_a_model_becomes_active(client: AppClient) -> None:
+    assert residuals(client) == {}
+    found = squares(client)
+    np.testing.assert_allclose(list(found.values()), [0, *[2 * k - 1 for k in range(1, 100)]])
+    part = residuals(client, start=10, stop="1970-01-01T00:00:12Z")
+    assert part == {"1970-01-01T00:00:10Z": 19.0, "1970-01-01T00:00:11Z": 21.0}
+
+
+def test_new_samples_go_on_from_the_state(client: AppClient) -> None:
+    squares(client)
+    send(client, [100], [10_000.0])
+    send(client, [101, 102], [None, 10_003.0])
+    found = list(residuals(client).values())
+    assert found[100:] == [199.0, None, None]
+    assert len(found) == 103
+
+
+def test_a_late_sample_gives_what_arrival_in_order_gives(client: AppClient) -> None:
+    squares(client)
+    for k in (100, 102, 103):
+        send(client, [k], [float(k * k)])
+        residuals(client)
+    assert list(residuals(client).values())[-3:] == [199.0, 102**2 - 100**2, 205.0]
+    send(client, [101], [101.0**2])
+    assert list(residuals(client).values())[-4:] == [199.0, 201.0, 203.0, 205.0]
+
+
+def test_state_survives_a_restart(make_client) -> None:
+    first = make_client(workbench=FakeWorkbench)
+    first.post("/v1/twins", json=SPEC)
+    squares(first)
+    first.close()
+    second = make_client(workbench=FakeWorkbench)
+    send(second, [100], [10_000.0])
+    found = list(residuals(second).values())
+    assert len(found) == 101 and found[-1] == 199.0
+
+
+def test_another_model_has_residuals_of_its_own(client: AppClient) -> None:
+    squares(client)
+    calibrate(client)
+    assert len(residuals(client)) == 100
+    assert client.get(f"{TWIN}/residuals").json()["model_version"][0] == 2
+    assert client.get(f"{TWIN}/residuals", params={"version": 1}).json()["model_version"][0] == 1
+
+
+def test_forecast_from_the_state(client: AppClient) -> None:
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).status_code == 409
+    squares(client)
+    send(client, [100], [7.0])
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60, "step_s": 20}).json()
+    assert found["time"] == [f"1970-01-01T00:0{m}:{s}Z" for m, s in ((2, "00"), (2, "20"), (2, "40"))]
+    assert found["values"]["T_px"] == {"mean": [7, 7, 7], "q05": [6.55] * 3, "q50": [7] * 3, "q95": [7.45] * 3}
+    assert (found["model_version"], found["from"]) == (1, "1970-01-01T00:01:40Z")
+    assert found["units"] == {"T_px": "K", "T_tank": "degC"}
+    plan = {"time": ["1970-01-01T00:02:00Z", 110], "values": {"Q_px": [5.0, 1.0]}}
+    body = {"horizon_s": 60, "step_s": 60, "plan": plan, "quantiles": [0.975]}
+    planned = client.post(f"{TWIN}/forecasts", json=body).json()
+    assert planned["values"]["T_px"] == {"mean": [12.0], "q97.5": [12.475]}
+
+
+@pytest.mark.parametrize(
+    ("body", "field"),
+    [
+        ({}, "horizon_s"),
+        ({"horizon_s": -5}, "horizon_s"),
+        ({"horizon_s": 1e15}, "horizon_s"),
+        ({"horizon_s": "long"}, "horizon_s"),
+        ({"horizon_s": 10, "step_s": 20}, "step_s"),
+        ({"horizon_s": 10, "step_s": 1e-9}, "step_s"),
+        ({"horizon_s": 10, "quantiles": [0.5, 1.0]}, "quantiles[1]"),
+        ({"horizon_s": 10, "quantiles": []}, "quantiles"),
+        ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q": [1]}}}, "plan.values.Q"),
+        ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q_px": []}}}, "plan.values.Q_px"),
+        ({"horizon_s": 10, "plan": {"time": [1, 1], "values": {"Q_px": [1, 2]}}}, "plan.time"),
+        ({"horizon_s": 10, "plan": {"time": ["x"], "values": {"Q_px": [1]}}}, "plan.time[0]"),
+    ],
+)
+def test_wrong_forecast_requests(client: AppClient, body: dict, field: str) -> None:
+    squares(client)
+    response = client.post(f"{TWIN}/forecasts", json=body)
+    assert response.status_code == 422, response.text
+    assert field in response.json()["detail"]
+
+
+def test_an_anomaly_opens_and_closes(client: AppClient) -> None:
+    send(client, list(range(100)), [0.0] * 100)
+    calibrate(client)
+    jumps = [40.0 * (k % 2) for k in range(30)]
+    send(client, list(range(100, 130)), jumps)
+    residuals(client)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert (anomaly["sensor"], anomaly["start"], anomaly["stop"]) == ("T_px", "1970-01-01T00:01:41Z", None)
+    send(client, list(range(130, 330)), [0.0] * 200)
+    residuals(client)
+    (closed,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert closed["id"] == anomaly["id"] and closed["stop"] is not None
+    assert closed["score"] >= anomaly["score"] > 5
+    assert client.get(f"{TWIN}/anomalies", params={"start": 320}).json() == {"anomalies": []}
