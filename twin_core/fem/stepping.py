@@ -20,7 +20,9 @@ _RESIDUAL = 1e-10
 """A stage is solved when its unbalanced heat is this part of all heat that moves: the energy balance of a step."""
 
 _ROUNDING_K = 1e-6
-"""Changes below this that no longer shrink are rounding, as in a very stiff conductor."""
+"""Changes that stay below this without solving the stage are rounding, as in a very stiff conductor."""
+
+_PATIENCE = 12
 
 _MOST_ITERATIONS = 25
 
@@ -136,11 +138,8 @@ class Sdirk2:
 
 
 def _at_rounding(steps: list[FloatArray]) -> bool:
-    """Return whether the last steps are so small, and shrink so little, that they are rounding."""
-    if len(steps) < 2:
-        return False
-    before, last = (float(np.abs(step).max()) for step in steps[-2:])
-    return (last < _ROUNDING_K and last > 0.5 * before) or last == 0.0
+    """Return whether many steps have been taken and the last is so small that it is rounding."""
+    return len(steps) >= _PATIENCE and float(np.abs(steps[-1]).max()) < _ROUNDING_K
 
 
 def _extend(steps: list[FloatArray], change_K: FloatArray) -> None:
