@@ -46,7 +46,7 @@ class Outcome:
     report
         The report of the diagnosis.
     misfit
-        Rms innovation and mean NIS of the calibrated declared model, which show that something is missing.
+        Per sensor its noise and the residuals of the calibrated declared model, which show that something is missing.
     elapsed_s
         Wall clock.
     url
@@ -117,8 +117,8 @@ def _operate(
     """Do what an operator does: register, stream, calibrate, look at residuals, diagnose, keep the report."""
     client.register(dump_spec(spec))
     _replay(client, spec.twin, out / RECORDING)
-    _finish(client, spec.twin, client.calibrate(spec.twin, activate=True), "calibrating")
-    misfit = _misfit(client, spec.twin)
+    made = _finish(client, spec.twin, client.calibrate(spec.twin, activate=True), "calibrating").result or {}
+    misfit = _misfit(client, spec.twin, made["model_version"])
     job = _finish(client, spec.twin, client.diagnose(spec.twin, holdout=HOLDOUT, activate=True), "tracing the misfit")
     report = dict(job.result or {})
     write_text(out / "report.json", to_json(report))
@@ -143,13 +143,16 @@ def _finish(client: TwinClient, twin: str, job: Job, title: str) -> Job:
     return job
 
 
-def _misfit(client: TwinClient, twin: str) -> dict[str, Any]:
-    """Return how badly one-step predictions of the declared model fit: rms innovation, mean NIS, sensors."""
+def _misfit(client: TwinClient, twin: str, version: int) -> dict[str, Any]:
+    """Return how badly the calibrated declared model fits: per sensor its noise, one-step and open-loop residuals."""
+    document = client.model(twin, version).model_dump()["model"]
     residuals = client.residuals(twin)
     innovations = {name: np.array(column, dtype=np.float64) for name, column in residuals.residual_K.items()}
-    nis = np.array(residuals.nis, dtype=np.float64)
-    rms = {name: float(np.sqrt(np.nanmean(column**2))) for name, column in innovations.items()}
-    return {"nis_mean": float(np.nanmean(nis)), "n_sensors": len(rms), "innovation_rms_K": rms}
+    return {
+        "noise_K": document["noise_K"],
+        "one_step_rms_K": {name: float(np.sqrt(np.nanmean(column**2))) for name, column in innovations.items()},
+        "open_loop_rmse_K": {name: row["rmse_K"] for name, row in document["summary"]["per_sensor"].items()},
+    }
 
 
 def hidden_effect(scenario: Scenario) -> dict[str, Any] | None:
@@ -183,10 +186,9 @@ def print_outcome(outcome: Outcome, out: Path) -> None:
     """Print what was hidden, what was found, and the error before and after."""
     from replay.cli.close_loop import describe, print_report
 
-    misfit = outcome.misfit
-    rows = [[name, short(value)] for name, value in misfit["innovation_rms_K"].items()]
-    print_table("one-step residual of the declared model", ["sensor", "rms K"], rows)
-    print_line(f"NIS {short(misfit['nis_mean'])}; {misfit['n_sensors']} would be consistent")
+    columns = list(outcome.misfit.values())
+    rows = [[sensor, *(short(column.get(sensor)) for column in columns)] for sensor in columns[0]]
+    print_table("residual of the declared model, calibrated", ["sensor", "noise K", "one step K", "open loop K"], rows)
     print_report(outcome.report)
     hidden = "nothing" if outcome.hidden is None else describe(outcome.hidden | {"parameters": {}})
     print_line(f"hidden by the simulator: {hidden}; found: {outcome.found}")

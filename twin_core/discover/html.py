@@ -110,7 +110,7 @@ def _evidence(report: Mapping[str, Any]) -> list[Json]:
         rows += [{"role": "alternative", **_row(a, a)} for a in finding.get("alternatives") or []]
     for option in report.get("not_supported") or []:
         evidence = option.get("evidence") or {}
-        effect = " + ".join(phrasing.in_words(effect) for effect in option.get("effects") or [])
+        effect = " + ".join(map(phrasing.label_in_words, option.get("effects") or []))
         rows.append({"role": "not supported", "effect": effect, "where": "", **_figures(evidence)})
     return rows
 

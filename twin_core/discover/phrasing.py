@@ -31,7 +31,7 @@ def headline(report: Mapping[str, Any]) -> str:
         first = f"{in_words(findings[0]['effect'])} {place(findings[0].get('where') or {})}"
         more = len(findings) - 1
         others = f", and {more} more effect{'s' if more > 1 else ''}" if more else ""
-        return f"{first.strip().capitalize()} was missing from the model{others}."
+        return f"{first[:1].upper()}{first[1:].strip()} was missing from the model{others}."
     if verdict == "unexplained":
         return "Something is missing from the model, and no known effect explains it."
     return "The declared model suffices: the data supports no missing effect."
@@ -63,6 +63,12 @@ def strength(log_bayes_factor: float | None) -> str:
 def in_words(effect: str) -> str:
     """Return the name of an effect as words."""
     return effect.replace("_", " ")
+
+
+def label_in_words(label: str) -> str:
+    """Return a label such as ``input_gain(Q_box)`` as words; the names in brackets stay as they are."""
+    name, bracket, rest = label.partition("(")
+    return f"{in_words(name)} {bracket}{rest}".strip()
 
 
 def place(where: Mapping[str, Any]) -> str:
