@@ -29,6 +29,13 @@ T = TypeVar("T")
 SHARE = 256
 """Most operations that share one commit."""
 READERS = 4
+PRAGMAS = (
+    "journal_mode = WAL",
+    "synchronous = FULL",
+    "foreign_keys = ON",
+    "mmap_size = 268435456",
+    "temp_store = MEMORY",
+)
 FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
 
 
@@ -50,8 +57,7 @@ class Database:
         self._path = path
         self._lock = FileLock(path)
         try:
-            self._connection = _connect(path)
-            migrate(self._connection)
+            self._connection = _open(path)
         except sqlite3.Error as error:
             self._lock.release()
             raise StoreError(f"{path}: cannot be used as a database ({error}); check TWIN_DATABASE_URL") from error
@@ -184,13 +190,24 @@ def _refusal(error: sqlite3.Error) -> Exception:
     return error
 
 
+def _open(path: Path) -> sqlite3.Connection:
+    """Return the writer's connection to a database of the present schema."""
+    connection = _connect(path)
+    try:
+        migrate(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
 def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-    connection.execute("PRAGMA journal_mode = WAL")
-    connection.execute("PRAGMA synchronous = FULL")
-    connection.execute("PRAGMA foreign_keys = ON")
-    connection.execute("PRAGMA mmap_size = 268435456")
-    connection.execute("PRAGMA temp_store = MEMORY")
-    if read_only:
-        connection.execute("PRAGMA query_only = ON")
+    settings = PRAGMAS + (("query_only = ON",) if read_only else ())
+    try:
+        for setting in settings:
+            connection.execute(f"PRAGMA {setting}")
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection

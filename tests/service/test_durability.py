@@ -1,0 +1,153 @@
+"""What was acknowledged survives: kills in the middle of ingest and of jobs, restarts, a full disk, a second server."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from service.client import ApiError, TwinClient, Unreachable
+from service.settings import read_settings
+from service.store.database import Database
+from service.store.lock import StoreError
+from tests.service.conftest import SPEC
+from tests.service.server import Server
+
+pytestmark = pytest.mark.e2e
+
+
+class Sender(threading.Thread):
+    """Sends samples of its own, one small batch after another, and remembers what was acknowledged."""
+
+    def __init__(self, client: TwinClient, lane: int) -> None:
+        super().__init__()
+        self._client, self._lane = client, lane
+        self.acknowledged: list[float] = []
+
+    def run(self) -> None:
+        with contextlib.suppress(Unreachable):
+            for number in range(100_000):
+                times = [float(self._lane * 10**7 + 3 * number + k) for k in range(3)]
+                report = self._client.ingest("benchsat", times, {"T_px": times})
+                assert report.accepted == 3
+                self.acknowledged += times
+
+
+def test_acknowledged_samples_survive_a_kill_exactly_once(tmp_path: Path) -> None:
+    with Server(tmp_path) as server:
+        server.client().register(SPEC)
+        acknowledged: set[float] = set()
+        for attempt in range(3):
+            senders = [Sender(server.client(), lane) for lane in range(4 * attempt, 4 * attempt + 4)]
+            for sender in senders:
+                sender.start()
+            while sum(len(sender.acknowledged) for sender in senders) < 300:
+                time.sleep(0.01)
+            server.kill()
+            for sender in senders:
+                sender.join()
+                acknowledged |= set(sender.acknowledged)
+            server.start()
+            client = server.client()
+            archive = client.archive("benchsat")
+            stored = archive.values["T_px"]
+            assert len(set(stored)) == len(stored) == archive.samples
+            assert acknowledged <= set(stored)
+            assert len(stored) - len(acknowledged) <= 3 * 4 * (
+                attempt + 1
+            )  # at most one batch per sender was under way
+            assert client.twin("benchsat").samples == archive.samples
+            assert client.twin("benchsat").seq >= archive.samples
+
+
+def test_a_job_interrupted_by_a_kill_is_marked_failed_and_leaves_no_process(tmp_path: Path) -> None:
+    with Server(tmp_path) as server:
+        client = server.client()
+        client.register(SPEC)
+        times = [60.0 * k for k in range(3000)]
+        client.ingest("benchsat", times, {"T_px": [290 + k % 7 for k in range(3000)], "Q_px": [1.0] * 3000})
+        job = client.calibrate("benchsat")
+        while job.state != "running":
+            job = client.job("benchsat", job)
+        time.sleep(0.5)
+        server.kill()
+        _wait_until_group_is_gone(server.process.pid)
+        server.start()
+        job = server.client().job("benchsat", job)
+        assert job.state == "failed"
+        assert "interrupted" in job.message
+
+
+def _wait_until_group_is_gone(group: int) -> None:
+    for _ in range(300):
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.05)
+    os.killpg(group, signal.SIGKILL)
+    raise AssertionError("worker processes outlived the service")
+
+
+def test_second_server_on_one_database_is_refused(tmp_path: Path) -> None:
+    with Server(tmp_path) as server:
+        environment = {**os.environ, "TWIN_PORT": "0", "TWIN_DATABASE_URL": f"sqlite:///{tmp_path / 'twin.sqlite3'}"}
+        second = subprocess.run(
+            [sys.executable, "-m", "service"], env=environment, capture_output=True, text=True, timeout=30, check=False
+        )
+        assert second.returncode == 2
+        assert "another server uses this database" in second.stderr
+        assert "Traceback" not in second.stderr
+        assert server.client().is_ready()
+
+
+def test_graceful_stop_finishes_what_it_acknowledged(tmp_path: Path) -> None:
+    with Server(tmp_path) as server:
+        client = server.client()
+        client.register(SPEC)
+        client.ingest("benchsat", [1.0, 2.0], {"T_px": [1.0, 2.0]})
+        assert server.stop() in (0, -signal.SIGTERM)
+        server.start()
+        assert server.client().archive("benchsat").values["T_px"] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize("content", [b"not a database at all, but longer than a header" * 40, None])
+def test_what_cannot_be_a_database_is_named(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "twin.sqlite3"
+    if content is None:
+        path = tmp_path / "no" / "such" / "folder.sqlite3"
+    else:
+        path.write_bytes(content)
+    with pytest.raises(StoreError, match="TWIN_DATABASE_URL"):
+        Database(read_settings(database_url=f"sqlite:///{path}").database_path)
+
+
+def test_full_disk_is_507_and_recovers(tmp_path: Path) -> None:
+    """A file-size limit stands in for the disk: SQLite sees the same short writes."""
+    script = (
+        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, resource.RLIM_INFINITY));"
+        "from service.__main__ import main; sys.exit(main())"
+    )
+    with Server(tmp_path, command=script) as server:
+        client = server.client()
+        client.register(SPEC)
+        stored, refusal = 0, None
+        while refusal is None:
+            times = [float(stored + k) for k in range(1000)]
+            try:
+                stored += client.ingest("benchsat", times, {"T_px": times}).accepted
+            except ApiError as error:
+                refusal = error
+        assert refusal.status == 507
+        assert client.twin("benchsat").samples == stored
+        assert client.archive("benchsat").samples == stored
+    with Server(tmp_path) as server:
+        client = server.client()
+        assert client.archive("benchsat").samples == stored
+        assert client.ingest("benchsat", times, {"T_px": times}).accepted == 1000
