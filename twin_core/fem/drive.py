@@ -9,6 +9,8 @@ from twin_core._typing import FloatArray
 from twin_core.fem.scenario import Scenario
 from twin_core.fem.signals import Path, Span
 
+_PARTS = 16
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -80,8 +82,18 @@ class Driving:
     boundary_K: FloatArray
 
 
-def drive_scenario(scenario: Scenario, clock: Clock, paths: dict[str, Path], fractions: tuple[float, ...]) -> Driving:
-    """Return the forcings at every stage. A held forcing keeps, in a step, the value of the step's start."""
+def drive_scenario(
+    scenario: Scenario,
+    clock: Clock,
+    paths: dict[str, Path],
+    fractions: tuple[float, ...],
+    weights: tuple[float, ...] | None = None,
+) -> Driving:
+    """Return the forcings at every stage. A held forcing keeps, in a step, the value of the step's start.
+
+    Where the stages have weights, others are shifted so that their weighted sum is the mean over the step: smooth
+    forcings keep the order of the scheme, and a jump inside a step (the edge of a shadow) delivers its due.
+    """
     stages_s = clock.start_s[:, None] + np.array(fractions) * clock.step_s
     starts_s = np.repeat(clock.start_s[:, None], len(fractions), axis=1)
     shape = (*stages_s.shape, len(scenario.forcings))
@@ -89,9 +101,17 @@ def drive_scenario(scenario: Scenario, clock: Clock, paths: dict[str, Path], fra
     for i, (name, forcing) in enumerate(scenario.forcings.items()):
         times_s = starts_s if forcing.is_held else stages_s
         channels[..., i] = paths[name](times_s)
+        if weights is not None and not forcing.is_held:
+            channels[..., i] += (_step_means(paths[name], clock) - channels[..., i] @ np.array(weights))[:, None]
         if forcing.kind == "power":
             inputs_W[..., i] = _deliver(scenario, name, channels[..., i], times_s)
     return Driving(inputs_W, channels, _boundaries(scenario, channels))
+
+
+def _step_means(path: Path, clock: Clock) -> FloatArray:
+    """Return the mean of a forcing over each step, (n_steps,), by the midpoint rule on sixteen parts."""
+    offsets = (np.arange(_PARTS) + 0.5) / _PARTS * clock.step_s
+    return path(clock.start_s[:, None] + offsets).mean(axis=1)
 
 
 def _deliver(scenario: Scenario, name: str, declared: FloatArray, time_s: FloatArray) -> FloatArray:

@@ -22,7 +22,7 @@ _LEAST_J = 1e-3
 """Below this nothing moved: the imbalance of an isolated field at rest is rounding over this, not over nothing."""
 
 _PER_SCENARIO = {"scenario", "seed", "forcings", "hidden", "time"}
-"""Fields in which scenarios that share a field may differ (of time: only the start and the sampling)."""
+"""Fields in which scenarios that share a field may differ (of time: only jitter, gaps and missing samples)."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def simulate_many(scenarios: Sequence[Scenario], progress: Progress = no_progres
     scheme_class = SCHEMES[scenarios[0].time.scheme]
     paths = [realise(scenario, clock) for scenario in scenarios]
     drivings = [
-        drive_scenario(scenario, clock, path, scheme_class.stage_fractions)
+        drive_scenario(scenario, clock, path, scheme_class.stage_fractions, scheme_class.input_weights)
         for scenario, path in zip(scenarios, paths, strict=True)
     ]
     history = _run(field, clock, scenarios, drivings, progress)
@@ -100,7 +100,7 @@ def _check_shared(scenarios: Sequence[Scenario]) -> None:
 
     def shared(scenario: Scenario) -> dict[str, Any]:
         time = scenario.time
-        steps = {"steps": (time.duration_s, time.step_s, time.sample_s, time.settle_s, time.scheme)}
+        steps = {"steps": (time.duration_s, time.step_s, time.sample_s, time.settle_s, time.scheme, time.start)}
         masses = {"masses": [mass for effect in scenario.hidden for mass in effect.masses()]}
         return scenario.model_dump(exclude=_PER_SCENARIO) | steps | masses | {"forcings": list(scenario.forcings)}
 

@@ -51,6 +51,9 @@ class Scheme(Protocol):
     """A time scheme on one field with one step size."""
 
     stage_fractions: tuple[float, ...]
+    """When in a step the inputs are asked for."""
+    input_weights: tuple[float, ...] | None
+    """How the stages' inputs add to a step's; None where the printed scheme knows one instant only."""
 
     def step(self, time_s: float, temperature_K: FloatArray, drive: Drive) -> FloatArray:
         """Return the temperatures one step later, (n_unknowns, n_cases)."""
@@ -72,6 +75,7 @@ class Sdirk2:
     """
 
     stage_fractions = (float(GAMMA), 1.0)
+    input_weights: tuple[float, ...] | None = (float(1.0 - GAMMA), float(GAMMA))
 
     def __init__(self, field: Field, step_s: float, reference_K: FloatArray) -> None:
         self.field, self.step_s = field, step_s
@@ -171,6 +175,7 @@ class Imex:
     """
 
     stage_fractions = (1.0,)
+    input_weights: tuple[float, ...] | None = None
 
     def __init__(self, field: Field, step_s: float, reference_K: FloatArray) -> None:
         self.field, self.step_s = field, step_s

@@ -33,6 +33,10 @@ def test_what_cannot_share_a_run_is_refused(two_plates: Maker) -> None:
     other = two_plates(joints=[{"between": ["a", "b"], "conductance_W_per_m2_K": 51.0}], scenario="other")
     with pytest.raises(ModelError, match=r"'other' cannot share a run with 'two-plates': joints differ"):
         simulate_many([load_scenario(two_plates()), load_scenario(other)])
+    later = two_plates()
+    later["time"] = later["time"] | {"start": "2026-05-01T00:00:00Z"}
+    with pytest.raises(ModelError, match="steps differ"):
+        simulate_many([load_scenario(two_plates()), load_scenario(later)])
     with pytest.raises(ModelError, match="no scenario"):
         simulate_many([])
 
@@ -78,6 +82,21 @@ def test_held_inputs_deliver_exactly_what_the_samples_say(two_plates: Maker) -> 
     heat_J = np.cumsum(result.record.channel("Q")[:-1] * 60.0)
     rise_K = result.record.channel("T_c")[1:] - 290.0
     np.testing.assert_allclose(rise_K, heat_J / 2e4, atol=1e-7)
+
+
+def test_the_edge_of_a_shadow_inside_a_step_delivers_its_due(two_plates: Maker) -> None:
+    """Sun with eclipse on an isolated plate, joined linearly: capacity times rise equals the integral of the sun."""
+    forcings = two_plates()["forcings"]
+    sun = {"signal": "sun", "peak": 80.0, "period_s": 5700.0, "phase_deg": 60.0, "eclipse_deg": 131.0}
+    forcings["Q"] = {"kind": "power", "unit": "W", "interpolation": "linear", "signal": sun}
+    time = {"duration_s": 6000, "step_s": 100, "sample_s": 100}
+    loads = [{"forcing": "Q", "place": "c"}]
+    record = simulate(load_scenario(two_plates(forcings=forcings, loads=loads, time=time))).record
+    angle_deg = 360.0 * (np.arange(600_000) + 0.5) * 0.01 / 5700.0
+    lit = np.abs(angle_deg - 180.0) >= 65.5
+    sun_W = np.where(lit, 80.0 * np.maximum(np.cos(np.radians(angle_deg - 60.0)), 0.0), 0.0)
+    # A step is seen in sixteen parts: an edge of 32 W is misplaced by 3 s at most, 5 mK.
+    assert record.channel("T_c")[-1] - 290.0 == pytest.approx(sun_W.sum() * 0.01 / 2e4, abs=5e-3)
 
 
 def test_settling_happens_before_the_record(two_plates: Maker) -> None:

@@ -8,6 +8,7 @@ import pytest
 from skfem import Basis, ElementQuad1, FacetBasis, LinearForm, MeshQuad
 
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
+from twin_core.fem import stepping
 from twin_core.fem.assembly import Assembler, assemble
 from twin_core.fem.field import Field
 from twin_core.fem.scenario import Scenario, load_scenario
@@ -179,3 +180,23 @@ def test_a_symmetric_problem_stays_symmetric() -> None:
         for image in ((1 - x, y), (x, 1 - y), (y, x)):
             assert by_place[tuple(np.round(image, 6))] == pytest.approx(value, abs=1e-8)
     assert np.ptp(temperature_K) > 0.5
+
+
+def test_a_step_costs_a_few_back_substitutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One factorisation for the whole run, and at most three solves per stage on average."""
+    counts = {"factorise": 0, "solve": 0}
+
+    class Counting:
+        def __init__(self, matrix: object) -> None:
+            counts["factorise"] += 1
+            self.solver = factorise(matrix)
+
+        def solve(self, right: np.ndarray) -> np.ndarray:
+            counts["solve"] += 1
+            return self.solver.solve(right)
+
+    factorise = stepping._factorise
+    monkeypatch.setattr(stepping, "_factorise", Counting)
+    run_to_K("sdirk2", 60.0)
+    assert counts["factorise"] == 1
+    assert counts["solve"] <= 3 * 2 * 50
