@@ -28,6 +28,9 @@ LENGTH_SHARES = (0.004, 0.02, 0.08)
 """Correlation lengths of the latent heat that are compared, as shares of the longest segment."""
 
 FLOOR_SHARE = 1e-3
+LONGEST_SHARE = 0.1
+"""The latent heat's correlation length is at most this share of the record, so that lasting heat stays improbable."""
+
 LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 START_SHARES = (1.0, 0.03)
 SMALLEST_LOG_STEP, SETTLED_LOG_STEP, LARGEST_LOG_STEP = 0.1, 0.3, 2.5
@@ -316,8 +319,8 @@ class SizeSearch:
 
     Attributes
     ----------
-    log_step : (n_nodes,)
-        Next change to be tried, in ln.
+    log_step : (n_nodes + 1,)
+        Next change to be tried, in ln: of the size on each node, and of the correlation length.
     """
 
     log_step: FloatArray
@@ -325,24 +328,42 @@ class SizeSearch:
     def improve(self, problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
         """Return a more likely size of the latent heat on each node, and its log-likelihood."""
         best, value = latent, log_likelihood(problem, latent, nominals)
-        for node in range(problem.n_nodes):
+        for position in range(problem.n_nodes + 1):
             moved = False
             for sign in (-1.0, 1.0):
-                std = best.std_W.copy()
-                std[node] *= np.exp(sign * self.log_step[node])
-                trial = replace(best, std_W=std)
+                trial = self._changed(best, position, sign, nominals)
                 found = log_likelihood(problem, trial, nominals)
                 if found > value:
                     best, value, moved = trial, found, True
                     break
-            self.log_step[node] *= 1.4 if moved else 0.5
+            self.log_step[position] *= 1.4 if moved else 0.5
         self.log_step = np.clip(self.log_step, SMALLEST_LOG_STEP, LARGEST_LOG_STEP)
         return best, value
+
+    def _changed(self, latent: LatentHeat, position: int, sign: float, nominals: Sequence[Nominal]) -> LatentHeat:
+        factor = float(np.exp(sign * self.log_step[position]))
+        if position == latent.std_W.size:
+            shortest = float(np.median(nominals[0].segment.forcing.step_s))
+            length = np.clip(latent.length_s * factor, shortest, LONGEST_SHARE * span_s(nominals))
+            return replace(latent, length_s=float(length))
+        std = latent.std_W.copy()
+        std[position] *= factor
+        return replace(latent, std_W=std)
+
+
+def span_s(nominals: Sequence[Nominal]) -> float:
+    """Return the length of the longest segment."""
+    return max(float(n.segment.record.time_s[-1] - n.segment.record.time_s[0]) for n in nominals)
+
+
+def new_search(n_nodes: int, log_step: float) -> SizeSearch:
+    """Return a search whose first steps are ``log_step``; that of the length is gentler."""
+    return SizeSearch(np.append(np.full(n_nodes, log_step), 0.7))
 
 
 def first_size(problem: Problem, nominals: Sequence[Nominal]) -> LatentHeat:
     """Return a starting size: the heat that the linearised model lacks from sample to sample, and the best length."""
-    span = max(float(n.segment.record.time_s[-1] - n.segment.record.time_s[0]) for n in nominals)
+    span = span_s(nominals)
     values = problem.network.parameters.values
     capacity = values[problem.network.capacity_index]
     swing = np.array([np.nanstd(n.starts_K, axis=0) for n in nominals]).max(axis=0)
@@ -364,6 +385,7 @@ def fit_with_latent_heat(
     *,
     near: HeatFit | None = None,
     n_passes: int = 12,
+    leashes: Sequence[float] = LEASHES,
 ) -> HeatFit:
     """Fit the free parameters in the presence of latent heat.
 
@@ -376,7 +398,9 @@ def fit_with_latent_heat(
     near
         A fit of the same telemetry from which temperatures and latent heat start.
     n_passes
-        Passes at most, of smoothing, a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
+        Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
+    leashes
+        Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
 
     Returns
     -------
@@ -387,7 +411,7 @@ def fit_with_latent_heat(
     values = parameters.to_values(free)
     if near is not None:
         nominals, latent = _carried_over(problem, values, near)
-        sizes = SizeSearch(np.full(problem.n_nodes, 1.5))
+        sizes = new_search(problem.n_nodes, 1.5)
         return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
@@ -397,8 +421,8 @@ def fit_with_latent_heat(
     started = []
     for share in START_SHARES:
         fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
-        sizes = SizeSearch(np.full(problem.n_nodes, LARGEST_LOG_STEP))
-        for leash in LEASHES:
+        sizes = new_search(problem.n_nodes, LARGEST_LOG_STEP)
+        for leash in leashes:
             fit = _pass(fit, sizes, leash, smoothing=True)
         started.append((fit, sizes))
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)

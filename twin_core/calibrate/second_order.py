@@ -119,6 +119,9 @@ def fit_network(
     optimum = _best_start(fit, progress)
     if optimum.status == "no_solution":
         raise ModelError(f"calibration failed: {ADVICE[optimum.status]}")
+    progress(0.8, "fitting again in the presence of latent heat")
+    again = fit_with_latent_heat(problem, optimum.unknowns[: problem.n_free], leashes=(np.inf,) * 3)
+    fit = max(fit, again, key=lambda f: f.log_posterior)
     progress(0.95, "weighing what is left")
     return fit, Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
 

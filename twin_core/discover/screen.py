@@ -88,8 +88,12 @@ def _joined(parts: Sequence[Along]) -> Along:
     )
 
 
-def responses(fit: HeatFit, survey: Survey, heats: Sequence[list[tuple[int, FloatArray]]]) -> list[FloatArray]:
-    """Return the sensors' linear response to unit heats.
+Column = tuple[list[tuple[int, FloatArray]], list[tuple[int, FloatArray]]]
+"""Unit heats as (node, (n_points,) in W) and unit changes of readings as (sensor, (n_points,) in K)."""
+
+
+def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[FloatArray]:
+    """Return the sensors' linear response to unit heats and to unit changes of readings.
 
     Parameters
     ----------
@@ -97,8 +101,8 @@ def responses(fit: HeatFit, survey: Survey, heats: Sequence[list[tuple[int, Floa
         The model about whose temperatures is linearised.
     survey
         Its points.
-    heats
-        Per column a list of (node, (n_points,) in W).
+    columns
+        One per amplitude.
 
     Returns
     -------
@@ -112,11 +116,11 @@ def responses(fit: HeatFit, survey: Survey, heats: Sequence[list[tuple[int, Floa
         n = stages.shape[2]
         jacobian = balance.jacobian_per_s.reshape(-1, 2, n, n)
         parts = []
-        for first in range(0, len(heats), COLUMNS_AT_ONCE):
-            some = heats[first : first + COLUMNS_AT_ONCE]
+        for first in range(0, len(columns), COLUMNS_AT_ONCE):
+            some = columns[first : first + COLUMNS_AT_ONCE]
             rows = [
                 (column, node, series[window] / balance.capacity_J_per_K[:, node])
-                for column, heat in enumerate(some)
+                for column, (heat, _) in enumerate(some)
                 for node, series in heat
             ]
             block, _ = march_sensitivities(
@@ -130,6 +134,10 @@ def responses(fit: HeatFit, survey: Survey, heats: Sequence[list[tuple[int, Floa
                 network.sensor_node,
                 GAMMA,
             )
+            at = np.maximum(2 * forcing.sample_step - 1, 0)
+            for column, (_, readings) in enumerate(some):
+                for sensor, series in readings:
+                    block[:, sensor, column] += series[window][at]
             parts.append(block)
         blocks.append(np.concatenate(parts, axis=2))
     return blocks
@@ -182,15 +190,16 @@ def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screen
         Physically possible probes, best first.
     """
     effects = list(candidates)
-    heats, owners = [], []
+    all_columns: list[Column] = []
+    owners = []
     for i, effect in enumerate(effects):
-        for column in effect.unit_heats(survey):
-            heats.append(column)
+        for column in zip(effect.unit_heats(survey), effect.unit_readings(survey), strict=True):
+            all_columns.append(column)
             owners.append(i)
     basis, residual = nuisance_basis(fit)
-    if not heats:
+    if not all_columns:
         return Screening((), residual, 0)
-    whitened = _whitened(fit, responses(fit, survey, heats))
+    whitened = _whitened(fit, responses(fit, survey, all_columns))
     whitened = np.vstack([whitened, np.zeros((residual.size - whitened.shape[0], whitened.shape[1]))])
     projected = whitened - basis @ (basis.T @ whitened)
     owner, probes = np.array(owners), []

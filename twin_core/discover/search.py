@@ -141,8 +141,6 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported."""
     screenings = screened(state.trial, fallback=fallback)
-    if not any(probe.gain > needed for probe in screenings[0].probes):
-        return False
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = max(len(ranked) for ranked in rankings)
     singles = [(effect,) for effect in shortlist(rankings, needed)]

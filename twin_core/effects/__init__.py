@@ -14,6 +14,7 @@ from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.effects.missing_conductor import MissingConductor
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
+from twin_core.effects.sensor_lag import SensorLag
 from twin_core.errors import SpecError
 
 REGISTRY: dict[str, type[Effect]] = {
@@ -28,6 +29,7 @@ REGISTRY: dict[str, type[Effect]] = {
         InputGain,
         InputPowerLaw,
         HiddenMass,
+        SensorLag,
         LearnedHeatFlow,
     )
 }

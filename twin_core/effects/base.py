@@ -195,6 +195,10 @@ class Effect(ABC):
                     columns[wanted[own[entry.index]]].append((entry.node, entry.series))
         return columns
 
+    def unit_readings(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
+        """Return d reading / d amplitude along the survey: per amplitude a list of (sensor, (n_points,) in K per unit)."""
+        return [[] for _ in self.amplitudes]
+
     def _null_value(self, full_name: str) -> float:
         short = full_name.removeprefix(f"{self.label}.")
         quality = next(q for q in self.qualities() if q.name == short)
