@@ -14,7 +14,8 @@ WIDTH, HEIGHT, MARGIN = 900.0, 400.0, 64.0
 _LABEL_ROOM = 70.0
 _LONGEST = 24
 _EFFECT_BEND = -26.0
-_STEPS = 200
+_STEPS = 400
+_STRETCH = 1.6
 
 
 def draw_network(network: Mapping[str, Any]) -> str:
@@ -96,10 +97,11 @@ def _fit(spots: FloatArray) -> FloatArray:
     centred = spots - spots.mean(axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     turned = centred @ axes.T
-    low, span = turned.min(axis=0), np.maximum(np.ptp(turned, axis=0), 1e-9)
-    size = np.array([WIDTH - 2 * MARGIN, HEIGHT - 2 * MARGIN])
-    flat = span < 0.05 * span.max()
-    return np.where(flat, MARGIN + size / 2, MARGIN + (turned - low) / span * size)
+    span = np.maximum(np.ptp(turned, axis=0), 1e-9)
+    across, down = (WIDTH - 2 * MARGIN) / span[0], (HEIGHT - 2 * MARGIN) / span[1]
+    scale = np.array([across, min(down, _STRETCH * across)])  # a chain stays a chain
+    middle = turned.min(axis=0) + span / 2
+    return np.array([WIDTH / 2, HEIGHT / 2]) + (turned - middle) * scale
 
 
 def _line(at: Mapping[str, tuple[float, float]], a: str, b: str, kind: str, label: str, *, bend: float = 0.0) -> str:

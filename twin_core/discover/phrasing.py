@@ -94,11 +94,12 @@ def number(value: Any, digits: int = 3) -> str:
         return "–"
     if value == 0:
         return "0"
-    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    rounded = float(f"{value:.{digits - 1}e}")
+    decimals = digits - 1 - math.floor(math.log10(abs(rounded)))
     if decimals > 6 or decimals < -4:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
-    return f"{round(value, decimals):.{max(decimals, 0)}f}".replace("-", "−")
+    return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
 
 
 def with_spread(mean: Any, std: Any) -> str:

@@ -1,0 +1,58 @@
+"""The record: what it refuses, and how its time is told."""
+
+import numpy as np
+import pytest
+
+from twin_core.errors import TelemetryError
+from twin_core.telemetry import Record
+
+EPOCH_NS = 1_767_225_600_000_000_000
+
+
+def record(times: list[float], epoch_ns: int | None = None) -> Record:
+    time_s = np.array(times, dtype=np.float64)
+    return Record(time_s, {"T": time_s + 300.0}, epoch_ns, "day.csv")
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([], "holds no samples"),
+        ([0.0, np.nan], "row 2: time is not finite"),
+        ([0.0, 2.0, 1.0], "row 3: time does not increase"),
+        ([0.0, 0.0], "row 2: time does not increase"),
+    ],
+)
+def test_time_axis(times: list[float], message: str) -> None:
+    with pytest.raises(TelemetryError, match=f"day.csv: {message}"):
+        record(times)
+
+
+def test_shapes_must_agree() -> None:
+    with pytest.raises(TelemetryError, match="channel 'T' has 2 samples, time has 3"):
+        Record(np.arange(3.0), {"T": np.zeros(2)}, None, "day.csv")
+
+
+def test_missing_channel_is_named_with_those_present() -> None:
+    with pytest.raises(TelemetryError, match=r"channel 'Q' is missing; the file has T"):
+        record([0.0]).channel("Q")
+
+
+def test_between_is_half_open() -> None:
+    part = record([0.0, 1.0, 2.0, 3.0]).between(1.0, 3.0)
+    assert part.time_s.tolist() == [1.0, 2.0]
+    assert part.values["T"].tolist() == [301.0, 302.0]
+    with pytest.raises(TelemetryError, match="holds no samples"):
+        part.between(5.0, 6.0)
+
+
+def test_dated_time_in_both_forms() -> None:
+    dated = record([0.0, 90.0], EPOCH_NS)
+    assert dated.present(90.0) == "2026-01-01T00:01:30Z"
+    assert dated.locate_s("2026-01-01T00:01:30Z") == 90.0
+
+
+def test_undated_time_is_a_number() -> None:
+    assert record([5.0]).present(5.0) == 5.0
+    with pytest.raises(TelemetryError, match="is a date, the record counts seconds"):
+        record([5.0]).locate_s("2026-01-01T00:00:00Z")
