@@ -62,12 +62,17 @@ def demo_scenario(effect: str, seed: int) -> tuple[Scenario, TwinSpec]:
     rng = np.random.default_rng([seed, 20])
     body = _body(seed, rng)
     operator = load_spec(_operator(body, rng))
-    drawn = list(DEMO_EFFECTS)[int(np.random.default_rng([seed, 21]).integers(len(DEMO_EFFECTS)))]
-    name = drawn if effect == "random" else effect
+    name = _drawn(seed) if effect == "random" else effect
     if name != "none":
         place = np.random.default_rng([seed, 22, zlib.crc32(name.encode())])
         body["hidden"] = [{"effect": name} | DEMO_EFFECTS[name](place, body)]
     return load_scenario(body), operator
+
+
+def _drawn(seed: int) -> str:
+    """Return the effect of a seed: shuffled anew for every eight seeds, so that eight in a row show each once."""
+    names, (block, place) = list(DEMO_EFFECTS), divmod(seed, len(DEMO_EFFECTS))
+    return names[int(np.random.default_rng([block, 21]).permutation(len(names))[place])]
 
 
 def _body(seed: int, rng: np.random.Generator) -> dict[str, Any]:
