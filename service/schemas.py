@@ -195,6 +195,18 @@ class Forecast(_Answer):
     units: dict[str, str | None]
 
 
+class Network(_Answer):
+    """The thermal network at one moment: temperatures in K, heats in W; a link's heat flows from its first end on."""
+
+    model_version: int
+    time: Instant
+    nodes: list[dict[str, Any]]
+    boundaries: list[dict[str, Any]]
+    links: list[dict[str, Any]]
+    loads: list[dict[str, Any]]
+    effects: list[dict[str, Any]]
+
+
 class Residuals(_Answer):
     """Innovations (measured minus predicted one step ahead) and their normalised squares."""
 

@@ -140,6 +140,9 @@ class Workbench(Protocol):
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""
 
+    def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
+        """Return temperatures and heat flows of the moment that the state describes."""
+
 
 def work(workbench: type[Workbench], function: str, task: Any, progress: Progress) -> Any:
     """Do one task; worker processes find this function by its name."""
@@ -236,6 +239,13 @@ class CoreWorkbench:
         quantiles = {q: columns(values) for q, values in ahead.quantiles_K.items()}
         return Forecasted(time_us, columns(ahead.mean_K), quantiles)
 
+    def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
+        """Return temperatures and heat flows of the moment that the state describes."""
+        from twin_core.flows import heat_flows
+
+        model = _cached_model(document)
+        return heat_flows(model, _record(model.spec, telemetry), state)
+
 
 def _spec(specification: Json) -> Any:
     from twin_core.network.spec import load_spec
@@ -294,4 +304,9 @@ def _outcome(model: Any, validation: Json, rival_rmse_K: float | None) -> Outcom
     summary = dict(model.summary)
     train = summary.pop("train", {})
     extra = {"parameters": summary.get("parameters", []), "notices": summary.get("notices", []), "fit": summary}
-    return Outcome(document, train, validation, document["effects"], rival_rmse_K, extra=extra)
+    return Outcome(document, train, validation, [_wire(e) for e in document["effects"]], rival_rmse_K, extra=extra)
+
+
+def _wire(effect: Json) -> Json:
+    """Return an effect of a model file as clients see it."""
+    return {"effect": effect["effect"], "where": effect["where"], "parameters": effect["values"]}

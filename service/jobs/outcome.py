@@ -7,7 +7,7 @@ from typing import Any
 
 from service.instants import now_us
 from service.messages import EventStretch, Stretch
-from service.store import events, jobs, models
+from service.store import anomalies, events, jobs, models
 from service.workbench import Outcome
 
 Json = dict[str, Any]
@@ -33,6 +33,7 @@ def save(connection: sqlite3.Connection, twin: int, finished: Finished) -> tuple
     reason = _reason_to_activate(connection, twin, finished)
     if reason is not None:
         models.activate(connection, twin, version, reason)
+    _explain(connection, twin, finished)
     stretches = _end(connection, twin, finished, version, reason)
     return (version if reason is not None else None), stretches
 
@@ -47,6 +48,26 @@ def _summary(finished: Finished) -> Json:
         "provenance": {**finished.provenance, "job": finished.job},
         **outcome.extra,
     }
+
+
+def _explain(connection: sqlite3.Connection, twin: int, finished: Finished) -> None:
+    """Give the unexplained anomalies of the sensors that a finding concerns their cause."""
+    if finished.outcome.report is None:
+        return
+    for finding in finished.outcome.report["findings"]:
+        cause = {"effect": finding["effect"], "where": finding["where"], "diagnosis": finished.job}
+        anomalies.explain(connection, twin, _sensors_at(finished.outcome.document["spec"], finding["where"]), cause)
+
+
+def _sensors_at(specification: Json, where: Json) -> list[str]:
+    """Return the sensors at the place of an effect; an input concerns the nodes that it heats."""
+    nodes = {where.get("node"), *where.get("nodes", ())}
+    nodes |= {load["node"] for load in specification.get("loads", ()) if load["channel"] == where.get("channel")}
+    found = {where["sensor"]} if "sensor" in where else set()
+    for node in specification["nodes"]:
+        sensors = node.get("sensor") or []
+        found |= set([sensors] if isinstance(sensors, str) else sensors) if node["id"] in nodes else set()
+    return sorted(found)
 
 
 def _reason_to_activate(connection: sqlite3.Connection, twin: int, finished: Finished) -> str | None:

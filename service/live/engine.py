@@ -35,6 +35,10 @@ class Engine:
         """Look ahead."""
         return await self._ask(_forecast, self._workbench, document, task)
 
+    async def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
+        """Return the heat flows of a moment."""
+        return await self._ask(_flows, self._workbench, document, telemetry, state)
+
     async def inspect(self, document: Json) -> Outcome:
         """Check a model that was made elsewhere."""
         return await self._ask(_inspect, self._workbench, document)
@@ -66,6 +70,10 @@ def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry,
 
 def _forecast(workbench: type[Workbench], document: str, task: ForecastTask) -> Forecasted:
     return workbench().forecast(document, task)
+
+
+def _flows(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json) -> Json:
+    return workbench().flows(document, telemetry, state)
 
 
 def _inspect(workbench: type[Workbench], document: Json) -> Outcome:

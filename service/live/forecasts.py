@@ -32,6 +32,13 @@ async def state_of(tracker: Tracker) -> tuple[Active, Position]:
     return tracker.active, tracker.position
 
 
+def moment(twin: Entry, active: Active, position: Position) -> Telemetry:
+    """Return the one sample that the state describes: inputs as they hold there, readings already used."""
+    values = {name: np.array([value]) for name, value in position.held.items()}
+    values |= {name: np.array([np.nan]) for name in twin.sensors}
+    return Telemetry(active.epoch_us, np.array([position.time_us], dtype=np.int64), values)
+
+
 def build_task(twin: Entry, active: Active, position: Position, request: ForecastRequest) -> ForecastTask:
     """Return what a worker needs for a forecast; BadField if the request asks for too much."""
     step_s = request.step_s or min(position.sampling_s, request.horizon_s)
@@ -44,10 +51,7 @@ def build_task(twin: Entry, active: Active, position: Position, request: Forecas
     longest_s = MOST_STEPS * float(active.parsed_step_s)
     if request.horizon_s > longest_s:
         raise BadField("horizon_s", f"must be at most {longest_s:g} s for this model")
-    start = np.array([position.time_us], dtype=np.int64)
-    values = {name: np.array([value]) for name, value in position.held.items()}
-    values |= {name: np.array([np.nan]) for name in twin.sensors}
-    telemetry = Telemetry(active.epoch_us, start, values)
+    telemetry = moment(twin, active, position)
     plan = None if request.plan is None else _plan(twin, request.plan, active.epoch_us)
     return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, tuple(request.quantiles))
 

@@ -9,11 +9,11 @@ from fastapi import APIRouter, Query, Response
 
 from service.deps import NamedTwin, Running, Service, reads
 from service.downsample import extremes
-from service.instants import format_instants
+from service.instants import format_instant, format_instants
 from service.live import forecasts
 from service.registry import Entry
 from service.routes.telemetry import MOST_POINTS, span
-from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Residuals
+from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Network, Residuals
 from service.store import anomalies, residuals
 from service.store.residuals import Residuals as Found
 
@@ -45,6 +45,15 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     made = await service.live.engine.forecast(active.document, task)
     document = forecasts.render(twin, active, position, made, request.quantiles)
     return Response(orjson.dumps(document), media_type="application/json")
+
+
+@router.get("/network", dependencies=[reads])
+async def network(service: Running, twin: NamedTwin) -> Network:
+    """Return temperatures of all nodes, the unsensed ones too, and every heat flow between them, as they are now."""
+    active, position = await forecasts.state_of(service.live.tracker(twin))
+    telemetry = forecasts.moment(twin, active, position)
+    flows = await service.live.engine.flows(active.document, telemetry, position.state)
+    return Network(model_version=active.version, time=format_instant(position.time_us), **flows)
 
 
 @router.get("/residuals", dependencies=[reads], response_model=Residuals)

@@ -87,6 +87,10 @@ class FakeWorkbench:
         quantiles = {q: {s: m + q - 0.5 for s, m in mean.items()} for q in task.quantiles}
         return Forecasted(time_us, mean, quantiles)
 
+    def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
+        nodes = [{"id": "px", "temperature_K": state["last"][0], "heat_W": 0.0, "sensed": True}]
+        return {"nodes": nodes, "boundaries": [], "links": [], "loads": [], "effects": []}
+
 
 def _outcome(specification: Json, rmse_K: float, rival: float | None, samples: int, stop_us: int) -> Outcome:
     stop = f"{np.datetime64(stop_us, 'us')}Z"

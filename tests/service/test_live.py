@@ -106,28 +106,35 @@ def test_forecast_from_the_state(client: AppClient) -> None:
     assert planned["values"]["T_px"] == {"mean": [12.0], "q97.5": [12.475]}
 
 
-@pytest.mark.parametrize(
-    ("body", "field"),
-    [
-        ({}, "horizon_s"),
-        ({"horizon_s": -5}, "horizon_s"),
-        ({"horizon_s": 1e15}, "horizon_s"),
-        ({"horizon_s": "long"}, "horizon_s"),
-        ({"horizon_s": 10, "step_s": 20}, "step_s"),
-        ({"horizon_s": 10, "step_s": 1e-9}, "step_s"),
-        ({"horizon_s": 10, "quantiles": [0.5, 1.0]}, "quantiles[1]"),
-        ({"horizon_s": 10, "quantiles": []}, "quantiles"),
-        ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q": [1]}}}, "plan.values.Q"),
-        ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q_px": []}}}, "plan.values.Q_px"),
-        ({"horizon_s": 10, "plan": {"time": [1, 1], "values": {"Q_px": [1, 2]}}}, "plan.time"),
-        ({"horizon_s": 10, "plan": {"time": ["x"], "values": {"Q_px": [1]}}}, "plan.time[0]"),
-    ],
-)
-def test_wrong_forecast_requests(client: AppClient, body: dict, field: str) -> None:
+def test_network_of_the_moment(client: AppClient) -> None:
+    assert client.get(f"{TWIN}/network").status_code == 409
     squares(client)
-    response = client.post(f"{TWIN}/forecasts", json=body)
-    assert response.status_code == 422, response.text
-    assert field in response.json()["detail"]
+    found = client.get(f"{TWIN}/network").json()
+    assert (found["time"], found["nodes"][0]["temperature_K"]) == ("1970-01-01T00:01:39Z", 99.0**2)
+
+
+WRONG_FORECASTS = (
+    ({}, "horizon_s"),
+    ({"horizon_s": -5}, "horizon_s"),
+    ({"horizon_s": 1e15}, "horizon_s"),
+    ({"horizon_s": "long"}, "horizon_s"),
+    ({"horizon_s": 10, "step_s": 20}, "step_s"),
+    ({"horizon_s": 10, "step_s": 1e-9}, "step_s"),
+    ({"horizon_s": 10, "quantiles": [0.5, 1.0]}, "quantiles[1]"),
+    ({"horizon_s": 10, "quantiles": []}, "quantiles"),
+    ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q": [1]}}}, "plan.values.Q"),
+    ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q_px": []}}}, "plan.values.Q_px"),
+    ({"horizon_s": 10, "plan": {"time": [1, 1], "values": {"Q_px": [1, 2]}}}, "plan.time"),
+    ({"horizon_s": 10, "plan": {"time": ["x"], "values": {"Q_px": [1]}}}, "plan.time[0]"),
+)
+
+
+def test_wrong_forecast_requests(client: AppClient) -> None:
+    squares(client)
+    for body, field in WRONG_FORECASTS:
+        response = client.post(f"{TWIN}/forecasts", json=body)
+        assert response.status_code == 422, (body, response.text)
+        assert field in response.json()["detail"]
 
 
 def test_an_anomaly_opens_and_closes(client: AppClient) -> None:
@@ -137,6 +144,7 @@ def test_an_anomaly_opens_and_closes(client: AppClient) -> None:
     send(client, list(range(100, 130)), jumps)
     residuals(client)
     (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert anomaly["cause"] is None
     assert (anomaly["sensor"], anomaly["start"], anomaly["stop"]) == ("T_px", "1970-01-01T00:01:41Z", None)
     send(client, list(range(130, 330)), [0.0] * 200)
     residuals(client)
@@ -144,3 +152,16 @@ def test_an_anomaly_opens_and_closes(client: AppClient) -> None:
     assert closed["id"] == anomaly["id"] and closed["stop"] is not None
     assert closed["score"] >= anomaly["score"] > 5
     assert client.get(f"{TWIN}/anomalies", params={"start": 320}).json() == {"anomalies": []}
+
+
+def test_a_diagnosis_names_the_cause(client: AppClient) -> None:
+    send(client, list(range(100)), [0.0] * 100)
+    calibrate(client)
+    send(client, list(range(100, 130)), [40.0 * (k % 2) for k in range(30)])
+    residuals(client)
+    path = client.post(f"{TWIN}/diagnoses").headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert anomaly["cause"]["effect"] == "constant_heat_load"
+    assert anomaly["cause"]["where"] == {"node": "px"}
