@@ -50,11 +50,11 @@ def pair() -> dict[str, Any]:
 
 @pytest.fixture(scope="session")
 def pair_telemetry() -> Callable[[int], str]:
-    """Return CSV text of so many rows of the pair: explicit Euler steps of its own heat balance, plus noise."""
+    """Return CSV text of so many rows of the pair: small Euler steps of its own heat balance, plus noise."""
 
     def make(n_rows: int) -> str:
         rng = np.random.default_rng(1)
-        step_s, sigma = 60.0, 5.670374419e-8
+        step_s, n_steps, sigma = 2.0, 30, 5.670374419e-8
         power_W = np.repeat(rng.choice([20.0, 60.0, 110.0], n_rows // 20 + 1), 20)[:n_rows]
         a_K = b_K = 270.0
         lines = ["time,T_a,T_b,Q_a"]
@@ -62,9 +62,10 @@ def pair_telemetry() -> Callable[[int], str]:
             noise = rng.normal(0.0, 0.05, 2)
             minutes = f"2026-01-{1 + row // 1440:02d}T{row // 60 % 24:02d}:{row % 60:02d}:00Z"
             lines.append(f"{minutes},{a_K - 273.15 + noise[0]:.4f},{b_K + noise[1]:.4f},{power_W[row]:g}")
-            exchange_W = 3.0 * (b_K - a_K)
-            a_K += step_s / 1.1e4 * (power_W[row] + exchange_W + sigma * 0.16 * (2.7**4 - a_K**4))
-            b_K -= step_s / 6.5e3 * exchange_W
+            for _ in range(n_steps):
+                exchange_W = 3.0 * (b_K - a_K)
+                a_K += step_s / 1.1e4 * (power_W[row] + exchange_W + sigma * 0.16 * (2.7**4 - a_K**4))
+                b_K -= step_s / 6.5e3 * exchange_W
         return "\n".join(lines) + "\n"
 
     return make

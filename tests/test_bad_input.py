@@ -143,7 +143,10 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("calibrate --spec spec.yaml --telemetry data.txt --out x.json", "data.txt: the name must end in"),
     ("calibrate --spec spec.yaml --telemetry data.csv --out x.txt", "x.txt: the name must end in"),
     ("calibrate --spec spec.yaml --telemetry data.csv --out no/x.json", "no/x.json: cannot be written"),
-    ("calibrate --spec spec.yaml --telemetry data.csv --method magic --out x.json", "--method"),
+    (
+        "calibrate --spec spec.yaml --telemetry data.csv --method magic --out x.json",
+        "unknown calibration method 'magic'",
+    ),
     ("calibrate --spec spec.yaml --telemetry data.csv data.csv --out x.json", "data.csv: is named twice"),
     ("calibrate --spec spec.yaml --telemetry data.csv undated.csv --out x.json", "counts seconds, data.csv is dated"),
     ("calibrate --spec spec.yaml --telemetry broken.mcap --out x.json", "broken.mcap: not a complete MCAP file"),

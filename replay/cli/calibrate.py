@@ -8,16 +8,21 @@ import click
 from replay.cli.command import FILE, Command
 
 
-@click.command(cls=Command, example="twin calibrate --spec sat.yaml --telemetry day1.csv day2.csv --out model.json")
-@click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
-@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP files, one per segment.")
-@click.option(
-    "--method",
-    default="second-order",
-    show_default=True,
-    type=click.Choice(["second-order", "neural-ode"]),
-    help="How to fit: exact sensitivities, or gradients through a neural ODE.",
+@click.command(
+    cls=Command,
+    short_help="Fit the declared network to telemetry.",
+    example="twin calibrate --spec sat.yaml --telemetry day1.csv day2.csv --out model.json",
 )
+@click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
+@click.option(
+    "--telemetry",
+    required=True,
+    multiple=True,
+    metavar="FILE...",
+    type=FILE,
+    help="CSV or MCAP files, one per segment.",
+)
+@click.option("--method", default="second-order", show_default=True, help="How to fit; docs/cli.md lists the methods.")
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, out: Path, as_json: bool) -> None:

@@ -18,12 +18,24 @@ VERDICTS = {
 
 
 @click.command(
-    "close-loop", cls=Command, example="twin close-loop --spec sat.yaml --telemetry flight.csv --holdout 0.3 --out loop"
+    "close-loop",
+    cls=Command,
+    short_help="Find and add what the model lacks.",
+    example="twin close-loop --spec sat.yaml --telemetry flight.csv --holdout 0.3 --out loop",
 )
 @click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
-@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP files, one per segment.")
+@click.option(
+    "--telemetry",
+    required=True,
+    multiple=True,
+    metavar="FILE...",
+    type=FILE,
+    help="CSV or MCAP files, one per segment.",
+)
 @click.option("--holdout", type=float, help="Share of the time span kept back at the end.  [default: 0.3]")
-@click.option("--holdout-telemetry", multiple=True, type=FILE, help="Separate files kept back instead.")
+@click.option(
+    "--holdout-telemetry", multiple=True, metavar="FILE...", type=FILE, help="Separate files kept back instead."
+)
 @click.option("--burn-in", type=float, help="First seconds of each hold-out file that tell its initial state.")
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
@@ -94,9 +106,8 @@ def _check(
 
 
 def _save(loop: "ClosedLoop", out: Path) -> None:
-    from twin_core.discover.html import render
-
     from replay.cli.console import to_json
+    from twin_core.discover.html import render
     from twin_core.files import make_folder, write_text
 
     make_folder(out)

@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 FILE = click.Path(path_type=Path)
+"""The type of every file and folder; what is wrong with one is said by whoever reads it."""
 
 
 class Command(click.Command):

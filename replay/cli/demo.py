@@ -14,7 +14,11 @@ from replay.cli.command import FILE, Command
 EFFECT = "random"
 
 
-@click.command(cls=Command, example="twin demo --effect radiation_to_sink --seed 3 --out demo-out")
+@click.command(
+    cls=Command,
+    short_help="From orbit to verdict, all of it.",
+    example="twin demo --effect radiation_to_sink --seed 3 --out demo-out",
+)
 @click.option("--out", default="demo-out", show_default=True, type=FILE, help="Folder for report and recording.")
 @click.option("--serve", is_flag=True, help="Leave the service and its dashboard running until interrupted.")
 @click.option("--effect", default=EFFECT, show_default=True, help="What to hide: an effect's name, random or none.")

@@ -16,10 +16,14 @@ _OUT = (".csv", ".json")
 
 
 @click.command(
-    cls=Command, example="twin forecast --model model.json --telemetry today.csv --horizon 86400 --out tomorrow.csv"
+    cls=Command,
+    short_help="Forecast temperatures with quantiles.",
+    example="twin forecast --model model.json --telemetry today.csv --horizon 86400 --out tomorrow.csv",
 )
 @click.option("--model", "model_file", required=True, type=FILE, help="Model of twin calibrate or twin close-loop.")
-@click.option("--telemetry", required=True, multiple=True, type=FILE, help="CSV or MCAP file up to now.")
+@click.option(
+    "--telemetry", required=True, multiple=True, metavar="FILE", type=FILE, help="CSV or MCAP file up to now."
+)
 @click.option("--horizon", required=True, type=float, help="Seconds to look ahead.")
 @click.option("--step", type=float, help="Seconds between forecasts.  [default: as the telemetry is sampled]")
 @click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP; inputs without a plan hold their last value.")

@@ -13,7 +13,11 @@ if TYPE_CHECKING:
     from service.client import TwinClient
 
 
-@click.command(cls=Command, example="twin replay orbits.mcap --url http://127.0.0.1:8000 --twin benchsat --rate 60")
+@click.command(
+    cls=Command,
+    short_help="Stream recordings into a service.",
+    example="twin replay orbits.mcap --url http://127.0.0.1:8000 --twin benchsat --rate 60",
+)
 @click.argument("files", metavar="FILE.mcap...", nargs=-1, required=True, type=FILE)
 @click.option("--url", required=True, help="Where the service listens.")
 @click.option("--twin", required=True, help="The twin's id.")

@@ -5,7 +5,7 @@ import click
 from replay.cli.command import Command
 
 
-@click.command(cls=Command, example="twin serve --port 8000")
+@click.command(cls=Command, short_help="Run the service and its dashboard.", example="twin serve --port 8000")
 @click.option("--host", help="Address to listen on.  [default: TWIN_HOST, else 127.0.0.1]")
 @click.option("--port", type=int, help="Port to listen on, 0 for a free one.  [default: TWIN_PORT, else 8000]")
 def serve(host: str | None, port: int | None) -> None:

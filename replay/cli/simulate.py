@@ -7,7 +7,11 @@ import click
 from replay.cli.command import FILE, Command
 
 
-@click.command(cls=Command, example="twin simulate --scenario examples/scenarios/plate.yaml --out plate.mcap")
+@click.command(
+    cls=Command,
+    short_help="Simulate orbits by finite elements.",
+    example="twin simulate --scenario examples/scenarios/cross-section.yaml --out orbits.mcap",
+)
 @click.option("--scenario", required=True, type=FILE, help="Scenario, YAML or JSON.")
 @click.option("--out", required=True, type=FILE, help="Recording to write, .mcap or .csv.")
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome as JSON.")

@@ -1,0 +1,99 @@
+"""The offline commands one after another, on telemetry of a pair whose capacities and conductance are known."""
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from replay.cli.main import main
+
+TRUE = {"C:a": 1.1e4, "C:b": 6.5e3, "G:a|b": 3.0}
+"""What the telemetry of the fixture was made with."""
+
+
+@pytest.fixture(scope="module")
+def desk(
+    tmp_path_factory: pytest.TempPathFactory, pair_declared: dict[str, Any], pair_telemetry: Callable[[int], str]
+) -> Path:
+    folder = tmp_path_factory.mktemp("desk")
+    (folder / "spec.yaml").write_text(yaml.safe_dump(pair_declared))
+    (folder / "data.csv").write_text(pair_telemetry(600))
+    return folder
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: str | Path) -> Any:
+    """Run a command that must succeed and return what it printed, parsed."""
+    code = main([*map(str, argv), "--json"])
+    printed = capsys.readouterr()
+    assert code == 0, printed.err
+    return json.loads(printed.out)
+
+
+def test_calibrate_then_forecast(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model, data = desk / "model.json", desk / "data.csv"
+    summary = run(capsys, "calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
+    found = {p["name"]: p for p in summary["parameters"]}
+    for name, value in TRUE.items():
+        # Five standard deviations, and half a Euler step of 2 s on time constants of 2000 s and more.
+        assert found[name]["mean"] == pytest.approx(value, rel=1e-3, abs=5 * found[name]["std"])
+    out = desk / "forecast.json"
+    printed = run(
+        capsys, "forecast", "--model", model, "--telemetry", data, "--horizon", "1800", "--step", "600", "--out", out
+    )
+    assert json.loads(out.read_text()) == printed
+    assert printed["time"][0] == "2026-01-01T10:09:00Z" and len(printed["time"]) == 3
+    assert printed["units"] == {"T_a": "degC", "T_b": "K"}
+    for sensor, bands in printed["values"].items():
+        assert set(bands) == {"mean", "q05", "q50", "q95"}
+        assert all(low < mid < high for low, mid, high in zip(bands["q05"], bands["q50"], bands["q95"], strict=True))
+        assert abs(bands["mean"][0]) < 100 if sensor == "T_a" else bands["mean"][0] > 200
+
+
+def test_forecast_follows_its_plan(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model, data = desk / "model.json", desk / "data.csv"
+    run(capsys, "calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
+    ends = {}
+    for power_W in (0, 200):
+        plan = desk / f"plan{power_W}.csv"
+        plan.write_text(f"time,Q_a\n2026-01-01T09:59:00Z,{power_W}\n")
+        out = desk / f"forecast{power_W}.csv"
+        run(capsys, "forecast", "--model", model, "--telemetry", data, "--horizon", "600", "--plan", plan, "--out", out)
+        rows = list(csv.DictReader(out.read_text().splitlines()))
+        ends[power_W] = float(rows[-1]["T_a_mean"])
+    # 200 W for 600 s into 11 kJ/K: 10.9 K, less what flows on to the neighbour and to space meanwhile.
+    assert 8.0 < ends[200] - ends[0] < 10.9
+
+
+def test_close_loop_leaves_its_three_files(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = desk / "loop"
+    arguments = ["close-loop", "--spec", desk / "spec.yaml", "--telemetry", desk / "data.csv", "--out", out]
+    report = run(capsys, *arguments)
+    assert sorted(path.name for path in out.iterdir()) == ["model.json", "report.html", "report.json"]
+    assert json.loads((out / "report.json").read_text()) == report
+    assert report["verdict"] == "no_effect_supported" and report["findings"] == []
+    assert report["holdout"]["stop"] == "2026-01-01T09:59:00Z"
+    assert "pair" in (out / "report.html").read_text()
+    assert main([str(a) for a in arguments]) == 0  # once more into the folder that exists, for people
+    printed = capsys.readouterr()
+    assert "the declared model suffices" in printed.out and printed.err == ""
+
+
+def test_simulate_in_both_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scenario = {
+        "scenario": "plate",
+        "mesh_size_m": 0.1,
+        "time": {"duration_s": 600, "step_s": 60, "sample_s": 60},
+        "regions": [{"id": "plate", "x_m": [0, 0.2], "y_m": [0, 0.2], "material": "electronics_box"}],
+        "sensors": [{"channel": "T_plate", "region": "plate", "noise_std_K": 0.1}],
+    }
+    (tmp_path / "plate.yaml").write_text(yaml.safe_dump(scenario))
+    for name in ("a.csv", "a.mcap"):
+        outcome = run(capsys, "simulate", "--scenario", tmp_path / "plate.yaml", "--out", tmp_path / name)
+        assert outcome["channels"] == ["T_plate"]
+        assert (tmp_path / name).stat().st_size > 0
+    rows = (tmp_path / "a.csv").read_text().splitlines()
+    assert rows[0] == "time_s,T_plate" and len(rows) == outcome["samples"] + 1
