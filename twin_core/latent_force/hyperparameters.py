@@ -223,6 +223,8 @@ def _laplace(posterior: Posterior, point: FloatArray, n_steps: int, converged: b
     value, likelihood, gradient, _ = posterior.expand(point)
     values = np.exp(point)
     notices = _blind_directions(posterior, point, hessian)
+    if not converged:
+        notices = (*notices, f"the climb did not come to rest in {n_steps} steps: some parameters trade for each other")
     curvature = (hessian - np.diag(gradient)) / np.outer(values, values)
     names = posterior.model.names
     if np.linalg.eigvalsh(hessian).max() >= 0:

@@ -20,8 +20,10 @@ from twin_core.latent_force.model import ForceModel, augment, drive, step_table
 from twin_core.latent_force.polynomial import Basis, ForcePolynomial
 from twin_core.latent_force.smooth import LatentForce
 
-MISFIT_SHARES = (1e-4, 1e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0)
-"""Misfits tried, as shares of the latent force's own standard deviation."""
+MISFIT_SHARES = (1e-4, 1e-2, 3e-2, 0.1, 0.3, 1.0)
+"""Misfits tried, as shares of the latent force's own standard deviation; the first is none at all."""
+NO_MISFIT = 0.5
+"""Probability a priori that the heat is a polynomial and nothing else; the other misfits share the rest."""
 EXHAUSTIVE = 300
 """Combinations of degrees up to which all are tried."""
 
@@ -40,6 +42,9 @@ class LearnedHeatFlow:
         Standard deviation of the heat that is left beside the polynomial, averaged over the misfits tried.
     log_evidence
         ln p(y | degrees).
+    log_bayes_factor
+        Of the polynomials against the latent force alone, a heat that does not repeat with temperature. Negative: the
+        data do not support a static heat flow, however well its curve looks.
     evidence_by_degree
         Degree common to all forces -> ln evidence.
     """
@@ -48,6 +53,7 @@ class LearnedHeatFlow:
     degrees: tuple[int, ...]
     misfit_W: FloatArray
     log_evidence: float
+    log_bayes_factor: float
     evidence_by_degree: dict[int, float]
 
 
@@ -149,6 +155,7 @@ def _learn(
         degrees,
         choice.misfit_W,
         choice.log_evidence,
+        choice.log_evidence - smoothed.log_likelihood,
         {d: family.log_evidence((d,) * len(bases)) for d in allowed.degrees},
     )
 
@@ -228,7 +235,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _Family:
-    """One problem per misfit, all equally likely a priori; what is learned is their average.
+    """One problem per misfit; what is learned is their average.
 
     ``misfits_W`` is (n_problems, n_forces).
     """
@@ -238,8 +245,12 @@ class _Family:
 
     def log_evidence(self, degrees: tuple[int, ...]) -> float:
         """Return ln p(y | degrees), averaged over the misfits."""
-        each = [problem.solve(degrees).log_evidence for problem in self.problems]
-        return float(logsumexp(each) - np.log(len(each)))
+        return float(logsumexp([p.solve(degrees).log_evidence for p in self.problems] + self._log_prior))
+
+    @property
+    def _log_prior(self) -> FloatArray:
+        others = len(self.problems) - 1
+        return np.log([1.0] if others == 0 else [NO_MISFIT, *[(1.0 - NO_MISFIT) / others] * others])
 
     def choose(self, degrees: range) -> tuple[int, ...]:
         """Return the combination of degrees of the highest evidence."""
@@ -259,7 +270,7 @@ class _Family:
     def solve(self, degrees: tuple[int, ...]) -> _Choice:
         """Return mean and covariance of the weights under the mixture over misfits."""
         each = [problem.solve(degrees) for problem in self.problems]
-        evidence = np.array([choice.log_evidence for choice in each])
+        evidence = np.array([choice.log_evidence for choice in each]) + self._log_prior
         total = float(logsumexp(evidence))
         shares = np.exp(evidence - total)
         means = np.array([choice.mean for choice in each])
@@ -267,7 +278,7 @@ class _Family:
         away = means - mean
         cov = np.tensordot(shares, [choice.cov for choice in each], 1) + (away.T * shares) @ away
         misfit = np.sqrt(shares @ self.misfits_W**2)
-        return _Choice(each[0].kept, mean, cov, total - float(np.log(len(each))), misfit)
+        return _Choice(each[0].kept, mean, cov, total, misfit)
 
 
 def _polynomial(k: int, basis: Basis, choice: _Choice, owner: IntArray) -> ForcePolynomial:
