@@ -151,7 +151,7 @@ def _effect_heat(search: Search, node: str, states_K: FloatArray) -> FloatArray 
     declared = search.base.fit.problem.n_nodes
     stages[:, :, :declared] = states_K[1:, None, :]
     forcing = segment.forcing
-    boundaries = fill_boundaries(network, values, forcing.boundaries_K.reshape(-1, forcing.boundaries_K.shape[2]))
+    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(0, forcing.n_steps))
     along: Along = forcing.along(stages.reshape(-1, stages.shape[2]), boundaries, 0, forcing.n_steps)
     position = network.layout.node(node)
     total = np.zeros(2 * forcing.n_steps)

@@ -58,7 +58,7 @@ def survey_of(fit: HeatFit) -> Survey:
     rates = []
     for nominal in fit.nominals:
         forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
-        flat = forcing.boundaries_K.reshape(-1, forcing.boundaries_K.shape[2])
+        flat = forcing.boundaries_flat_K(0, forcing.n_steps)
         filled = fill_boundaries(network, values, flat)
         parts.append(forcing.along(stages.reshape(-1, stages.shape[2]), filled, 0, forcing.n_steps))
         balance = balance_along(network, values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)

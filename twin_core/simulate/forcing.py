@@ -46,6 +46,10 @@ class Forcing:
         """Number of time steps."""
         return int(self.step_s.size)
 
+    def boundaries_flat_K(self, first: int, last: int) -> FloatArray:
+        """Return the boundaries at the stages of steps first..last-1, (2 n_steps, n_boundaries): there may be none."""
+        return self.boundaries_K[first:last].reshape(2 * (last - first), self.boundaries_K.shape[2])
+
     def along(self, temperatures_K: FloatArray, boundaries_K: FloatArray, first: int, last: int) -> Along:
         """Return the stage points of steps first..last-1 flattened to (2 n_steps, ...), at given temperatures."""
         window = slice(first, last)

@@ -131,10 +131,8 @@ def balance_along(
 
     ``extra_W`` (n_steps, n_nodes) is heat beyond the network's terms; a capacity answers to it as to any other.
     """
-    boundaries = forcing.boundaries_K[first:last].reshape(-1, forcing.boundaries_K.shape[2])
-    along = forcing.along(
-        stages_K.reshape(-1, stages_K.shape[2]), fill_boundaries(network, values, boundaries), first, last
-    )
+    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
+    along = forcing.along(stages_K.reshape(-1, stages_K.shape[2]), boundaries, first, last)
     extra = None if extra_W is None else np.repeat(extra_W, 2, axis=0)
     return evaluate_balance(network, values, along, derivatives=derivatives, extra_W=extra)
 
