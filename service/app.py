@@ -14,7 +14,7 @@ from service.jobs.runner import Jobs
 from service.live.live import Live
 from service.metrics import Metrics, Observe
 from service.registry import Registry
-from service.routes import health, jobs, live, models, streams, telemetry, twins
+from service.routes import dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.settings import Settings, read_settings
 from service.store import jobs as job_table
 from service.store import twins as twin_table
@@ -33,6 +33,7 @@ ROUTERS = (
     models.router,
     live.router,
     streams.router,
+    dashboard.router,
 )
 
 
@@ -94,6 +95,7 @@ def create_app(
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
+    app.mount("/assets", dashboard.assets, name="assets")
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Gate, keys=settings.roles)
     app.add_middleware(Observe, metrics=metrics)

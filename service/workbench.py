@@ -189,8 +189,8 @@ class CoreWorkbench:
             false_alarm_rate=task.false_alarm_rate,
             progress=progress,
         )
-        after = loop.report["after"]
-        validation = {"rmse_K": after["rmse_K"], "on": "the hold-out of the diagnosis"}
+        before, after = loop.report["before"]["rmse_K"], loop.report["after"]["rmse_K"]
+        validation = {"rmse_K": after, "before_rmse_K": before, "on": "the hold-out of the diagnosis"}
         outcome = _outcome(loop.model, validation, None)
         return Outcome(
             outcome.document,

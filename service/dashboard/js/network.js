@@ -1,0 +1,179 @@
+// The thermal network as a drawing: places found once, colours and flows brought up to date.
+import { effectWords, heat, number, toUnit, unitName, watts } from "./format.js";
+
+const SVG = "http://www.w3.org/2000/svg";
+const MARGIN = 58, APART = 125;
+let WIDTH = 900, HEIGHT = 430;
+
+const draw = (tag, attributes, text) => {
+  const element = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  if (text !== undefined) element.textContent = text;
+  return element;
+};
+
+// Stress majorisation (Gansner, Koren, North 2004): drawn distances follow the number of links between two places.
+function layout(names, links) {
+  const n = names.length, index = new Map(names.map((name, i) => [name, i]));
+  const far = Array.from({ length: n }, (_, i) => Array.from({ length: n }, (_, j) => (i === j ? 0 : Infinity)));
+  for (const [a, b] of links) {
+    const i = index.get(a), j = index.get(b);
+    if (i !== undefined && j !== undefined && i !== j) far[i][j] = far[j][i] = 1;
+  }
+  for (let k = 0; k < n; k++) for (let i = 0; i < n; i++) for (let j = 0; j < n; j++) far[i][j] = Math.min(far[i][j], far[i][k] + far[k][j]);
+  const spots = names.map((_, i) => [Math.cos((2 * Math.PI * i) / n) * n * 0.4, Math.sin((2 * Math.PI * i) / n) * n * 0.25]);
+  for (let round = 0; round < 300; round++) {
+    for (let i = 0; i < n; i++) {
+      let x = 0, y = 0, total = 0;
+      for (let j = 0; j < n; j++) {
+        if (i === j) continue;
+        const d = Number.isFinite(far[i][j]) ? far[i][j] : 3, w = 1 / (d * d);
+        const dx = spots[i][0] - spots[j][0], dy = spots[i][1] - spots[j][1], length = Math.hypot(dx, dy) || 1e-6;
+        x += w * (spots[j][0] + (d * dx) / length);
+        y += w * (spots[j][1] + (d * dy) / length);
+        total += w;
+      }
+      if (total) spots[i] = [x / total, y / total];
+    }
+  }
+  return fit(names, spots);
+}
+
+function fit(names, spots) {
+  const [xs, ys] = [0, 1].map((c) => spots.map((s) => s[c]));
+  const scale = (values, size) => {
+    const low = Math.min(...values), high = Math.max(...values), room = size - 2 * MARGIN;
+    return values.map((v) => (high - low < 1e-9 ? size / 2 : MARGIN + ((v - low) / (high - low)) * room));
+  };
+  const [x, y] = [scale(xs, WIDTH), scale(ys, HEIGHT)];
+  return new Map(names.map((name, i) => [name, [x[i], y[i]]]));
+}
+
+// Moves places apart that would cover each other, and labels with them.
+function spread(places) {
+  const spots = [...places.values()], inside = (v, size) => Math.min(size - MARGIN, Math.max(MARGIN, v));
+  for (let round = 0; round < 120; round++) {
+    for (const a of spots) for (const b of spots) {
+      if (a === b) continue;
+      const dx = a[0] - b[0] || 0.1, dy = (a[1] - b[1] || 0.1) * 1.15, gap = Math.hypot(dx, dy);
+      if (gap >= APART) continue;
+      const push = (APART - gap) / gap / 4;
+      a[0] = inside(a[0] + dx * push, WIDTH);
+      a[1] = inside(a[1] + dy * push, HEIGHT);
+      b[0] = inside(b[0] - dx * push, WIDTH);
+      b[1] = inside(b[1] - dy * push, HEIGHT);
+    }
+  }
+  return places;
+}
+
+function curve([ax, ay], [bx, by], bend) {
+  const length = Math.hypot(bx - ax, by - ay) || 1;
+  const mx = (ax + bx) / 2 - ((by - ay) / length) * bend, my = (ay + by) / 2 + ((bx - ax) / length) * bend;
+  return { path: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, middle: [(ax + bx) / 4 + mx / 2, (ay + by) / 4 + my / 2] };
+}
+
+export class NetworkDrawing {
+  constructor(host) {
+    this.host = host;
+    this.key = null;
+  }
+
+  // picture: {nodes: [{id, temperature_K, heat_W, sensed}], boundaries, links, loads, effects}; temperatures may be null.
+  update(picture, unit) {
+    const names = [...picture.nodes, ...picture.boundaries].map((p) => p.id);
+    const narrow = this.host.clientWidth < 620;
+    [WIDTH, HEIGHT] = narrow ? [480, 520] : [900, 430];
+    const key = JSON.stringify([narrow, names, picture.links.map((l) => l.ends)]);
+    if (key !== this.key) {
+      this.places = spread(layout(names, picture.links.map((l) => l.ends)));
+      this.key = key;
+    }
+    const svg = draw("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": describe(picture, unit) });
+    const strongest = Math.max(1e-9, ...picture.links.map((l) => Math.abs(l.heat_W || 0)));
+    const joined = new Set();
+    const labels = [];
+    for (const link of picture.links) svg.append(...this.link(link, strongest, joined, labels));
+    for (const effect of picture.effects) svg.append(...this.effect(effect));
+    const known = picture.nodes.map((p) => p.temperature_K).filter((t) => t !== null);
+    const low = Math.min(...known), high = Math.max(...known);
+    for (const boundary of picture.boundaries) svg.append(...this.sink(boundary, unit));
+    for (const node of picture.nodes) {
+      const loads = picture.loads.filter((l) => l.node === node.id).reduce((sum, l) => sum + l.heat_W, 0);
+      svg.append(...this.node(node, (node.temperature_K - low) / Math.max(high - low, 1), unit, loads));
+    }
+    svg.append(...labels);
+    this.host.replaceChildren(svg);
+  }
+
+  link(link, strongest, joined, labels) {
+    const [a, b] = link.ends.map((end) => this.places.get(end));
+    const pair = [...link.ends].sort().join("|");
+    const bend = link.kind === "radiator" || joined.has(pair) ? 22 : 0;
+    joined.add(pair);
+    const { path, middle } = curve(a, b, bend);
+    const share = Math.abs(link.heat_W || 0) / strongest, width = 2 + 7 * Math.sqrt(share);
+    const parts = [draw("path", { d: path, class: "tube", "stroke-width": width, opacity: link.kind === "radiator" ? 0.45 : 0.9 })];
+    if (link.heat_W === null) return parts;
+    const flow = draw("path", {
+      d: path, class: `flow${link.heat_W < 0 ? " back" : ""}`, "stroke-width": Math.max(1.5, width * 0.5),
+      stroke: link.kind === "radiator" ? "#7a6ff0" : "#e8743b",
+    });
+    flow.style.animationDuration = `${(1.9 - 1.4 * Math.sqrt(share)).toFixed(2)}s`;
+    if (share < 0.004) flow.style.animation = "none";
+    flow.append(draw("title", {}, `${link.ends.join(" → ")}: ${watts(link.heat_W)}`));
+    labels.push(draw("text", { x: middle[0], y: middle[1] - 5, class: "value halo" }, watts(Math.abs(link.heat_W))));
+    return [...parts, flow];
+  }
+
+  effect(effect) {
+    const ends = effect.where.nodes || [effect.where.node, effect.where.sink || effect.where.boundary];
+    const total = Object.values(effect.heat_W)[0];
+    const label = `${effectWords({ effect: effect.effect, where: {} })}${total === undefined ? "" : ` ${watts(total)}`}`;
+    const [a, b] = ends.map((end) => this.places.get(end));
+    if (a && b) {
+      const { path, middle } = curve(a, b, -30);
+      return [draw("path", { d: path, class: "effect" }), draw("text", { x: middle[0], y: middle[1] - 6, class: "effect-label halo" }, label)];
+    }
+    if (!a) return [];
+    return [draw("circle", { cx: a[0], cy: a[1], r: 33, class: "effect" }), draw("text", { x: a[0], y: a[1] - 40, class: "effect-label halo" }, label)];
+  }
+
+  sink({ id, temperature_K }, unit) {
+    const [x, y] = this.places.get(id);
+    const parts = [draw("rect", { x: x - 24, y: y - 16, width: 48, height: 32, rx: 8, class: "sink" }), draw("text", { x, y: y + 32, class: "halo" }, id)];
+    const text = temperature_K === null ? "" : number(toUnit(temperature_K, "K", unit), 0);
+    return [...parts, draw("text", { x, y: y + 4, class: "value" }, text)];
+  }
+
+  node({ id, temperature_K, heat_W, sensed }, share, unit, loads) {
+    const [x, y] = this.places.get(id), known = temperature_K !== null;
+    const disc = draw("circle", { cx: x, cy: y, r: 25, class: sensed === false ? "node hidden-node" : "node", fill: known ? heat(share) : "var(--line-strong)" });
+    disc.append(draw("title", {}, known ? `${id}: ${number(toUnit(temperature_K, "K", unit))} ${unitName(unit)}, net ${watts(heat_W)}` : id));
+    const ink = known && share > 0.78 ? "#221408" : "#ffffff";
+    const parts = [disc, draw("text", { x, y: y + 4, class: "inside", style: `fill:${ink}` }, known ? number(toUnit(temperature_K, "K", unit), 1) : "")];
+    parts.push(draw("text", { x, y: y + 41, class: "halo" }, id));
+    if (Math.abs(loads) > 1e-6) parts.push(draw("text", { x, y: y - 31, class: "value halo" }, `↓ ${watts(loads)}`));
+    return parts;
+  }
+}
+
+const describe = (picture, unit) => {
+  const temperatures = picture.nodes.filter((p) => p.temperature_K !== null)
+    .map((p) => `${p.id} ${number(toUnit(p.temperature_K, "K", unit), 1)} ${unitName(unit)}`);
+  return `Thermal network of ${picture.nodes.length} nodes. ${temperatures.join(", ")}`;
+};
+
+// What can be drawn before any model is active: the declaration with the sensors' last readings.
+export function declared(specification, latest_K) {
+  const sensorOf = (node) => (Array.isArray(node.sensor) ? node.sensor[0] : node.sensor);
+  return {
+    nodes: specification.nodes.map((n) => ({ id: n.id, temperature_K: latest_K[sensorOf(n)] ?? null, heat_W: 0, sensed: Boolean(n.sensor) })),
+    boundaries: Object.entries(specification.boundaries || {}).map(([id, b]) => ({ id, temperature_K: b.value_K ?? null })),
+    links: [
+      ...(specification.conductors || []).map((c) => ({ kind: "conductor", ends: c.between, heat_W: null })),
+      ...(specification.radiators || []).map((r) => ({ kind: "radiator", ends: [r.node, r.sink], heat_W: null })),
+    ],
+    loads: [], effects: [],
+  };
+}

@@ -1,0 +1,86 @@
+// The panels beside the plots: readings, anomalies, jobs, model versions.
+import { clock, colour, count, effectWords, make, number, seconds, span, toUnit, unitName } from "./format.js";
+
+const quiet = (text) => make("li", { class: "quiet" }, text);
+
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies }) {
+  const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
+  const show = (value, from) => number(toUnit(value, from, unit), 2);
+  const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
+  const rows = sensors.map((sensor) => {
+    const { name } = sensor, from = units[name], next = ahead ? ahead[name] : null;
+    return make("tr", {},
+      make("td", {}, make("span", { class: "dot", style: `background:${colour(sensor.index)};margin-right:8px` }), name),
+      make("td", { class: "num big" }, latest[name] === undefined ? "–" : show(latest[name], from)),
+      make("td", { class: "num" }, next ? show(next.mean.at(-1), from) : "–"),
+      make("td", { class: "num sub" }, next ? `${show(Math.min(...next.q05), from)} … ${show(Math.max(...next.q95), from)}` : ""),
+      make("td", {}, make("span", { class: open.has(name) ? "state bad" : "state", role: "img", "aria-label": open.has(name) ? "anomaly" : "as expected", title: open.has(name) ? "anomaly" : "as expected" })));
+  });
+  table.replaceChildren(make("thead", {}, head), make("tbody", {}, ...rows));
+  return unitName(unit);
+}
+
+export function drawAnomalies(list, anomalies, sensors, onPick) {
+  if (!anomalies.length) return list.replaceChildren(quiet("Every sensor behaves as its model says."));
+  list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
+    const index = sensors.findIndex((s) => s.name === anomaly.sensor);
+    const open = anomaly.stop === null, start = seconds(anomaly.start);
+    const cause = anomaly.cause ? effectWords(anomaly.cause) : open ? "cause unknown yet" : "cause not traced";
+    const length = open ? "lasts" : `for ${span(Math.max(1, seconds(anomaly.stop) - start))}`;
+    return make("li", {}, make("button", { class: "item", onclick: () => onPick(anomaly), "aria-label": `Show anomaly of ${anomaly.sensor}` },
+      make("div", { class: "row" },
+        make("span", { class: "dot", style: `background:${colour(Math.max(index, 0))}` }), make("b", {}, anomaly.sensor),
+        make("span", { class: `chip ${open ? "bad" : ""}` }, `${number(anomaly.score, 1)} σ`)),
+      make("div", { class: "message" }, `${clock(start)} · ${length} · ${cause}`)));
+  }));
+}
+
+const LOOK = { queued: "", running: "accent", succeeded: "good", failed: "bad", cancelled: "warn" };
+
+export function drawJobs(list, jobs, { onCancel, onReport }) {
+  if (!jobs.length) return list.replaceChildren(quiet("Calibrate to fit the model to the archive. Diagnose to find what it lacks."));
+  list.replaceChildren(...jobs.slice(0, 12).map((job) => {
+    const busy = job.state === "queued" || job.state === "running";
+    const button = busy
+      ? make("button", { class: "small", onclick: () => onCancel(job) }, "Cancel")
+      : job.kind === "diagnosis" && job.state === "succeeded"
+        ? make("button", { class: "small", onclick: () => onReport(job) }, "Report") : make("span", { class: "sub" }, clock(seconds(job.created), false));
+    return make("li", {},
+      make("div", { class: "row" }, make("b", {}, job.kind), make("span", { class: `chip ${LOOK[job.state]}` }, job.state), button),
+      busy ? make("progress", { max: 1, value: job.progress, "aria-label": `${job.kind} ${Math.round(job.progress * 100)} %` }) : null,
+      make("div", { class: "message" }, jobWords(job)));
+  }));
+}
+
+function jobWords(job) {
+  const { result } = job;
+  if (job.state !== "succeeded" || !result) return job.message;
+  if (job.kind === "calibration") {
+    const rmse = result.validation && result.validation.rmse_K !== null ? `, ${number(result.validation.rmse_K, 3)} K on recent data` : "";
+    return `version ${result.model_version}${rmse}; ${result.activated ? `active (${result.reason})` : "not activated: the active one is as good"}`;
+  }
+  const names = (result.findings || []).map(effectWords).join(", ");
+  const verdict = { effect_added: names || "an effect was found", no_effect_supported: "nothing is missing that the data support", unexplained: "something is missing that has no name" };
+  return `${verdict[result.verdict] || result.verdict}${result.model_version ? `; version ${result.model_version}` : ""}`;
+}
+
+export function drawModels(table, models, onActivate) {
+  const titles = ["Version", "", "Made by", "Created", "Trained on", "Error", "Effects beyond the declaration", ""];
+  const head = make("tr", {}, ...titles.map((text) => make("th", {}, text)));
+  const rows = [...models].reverse().map((model) => make("tr", {},
+    make("td", {}, make("b", {}, `v${model.version}`)),
+    make("td", {}, model.active ? make("span", { class: "chip good" }, "active") : null),
+    make("td", {}, make("span", { class: `chip ${model.source === "diagnosis" ? "accent" : ""}` }, model.source)),
+    make("td", { class: "sub" }, clock(seconds(model.created))),
+    make("td", { class: "sub" }, model.train.samples ? `${count(model.train.samples)} samples` : "–"),
+    make("td", {}, errorCell(model.validation)),
+    make("td", { class: "grow" }, ...(model.effects.length ? model.effects.map((e) => make("span", { class: "chip accent" }, effectWords(e))) : [make("span", { class: "sub" }, "none")])),
+    make("td", {}, model.active ? null : make("button", { class: "small", onclick: () => onActivate(model) }, "Activate"))));
+  table.replaceChildren(make("thead", {}, head), make("tbody", {}, ...rows));
+}
+
+function errorCell(validation) {
+  const after = make("b", { title: validation.on || "" }, `${number(validation.rmse_K, 3)} K`);
+  if (!Number.isFinite(validation.before_rmse_K)) return after;
+  return make("span", { class: "fall" }, make("s", {}, `${number(validation.before_rmse_K, 3)}`), "→", after);
+}
