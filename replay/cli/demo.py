@@ -30,18 +30,22 @@ def demo(out: Path, serve: bool, effect: str, seed: int, as_json: bool) -> int:
     Exits with 0 only if the effect was found and the held-out error fell.
     """
     from replay.cli.console import print_line, to_json
-    from replay.cli.demo_run import print_outcome, run_demo
+    from replay.cli.demo_run import StepFailed, print_outcome, run_demo
 
     if out.exists() and not out.is_dir():
         raise click.UsageError(f"--out {out} is a file; name a folder")
-    with _terminable(), run_demo(effect, seed, out) as outcome:
-        if as_json:
-            print_line(to_json(outcome.to_json()).rstrip())
-        else:
-            print_outcome(outcome, out)
-        if serve:
-            print_line(f"dashboard: {outcome.url} (Ctrl-C ends it)")
-            _wait()
+    try:
+        with _terminable(), run_demo(effect, seed, out) as outcome:
+            if as_json:
+                print_line(to_json(outcome.to_json()).rstrip())
+            else:
+                print_outcome(outcome, out)
+            if serve:
+                print_line(f"dashboard: {outcome.url} (Ctrl-C ends it)")
+                _wait()
+    except StepFailed as error:
+        click.echo(f"twin: {error}", err=True)
+        return 1
     return 0 if outcome.success else 1
 
 

@@ -18,7 +18,6 @@ from replay.player import play
 from replay.source import load
 from service.client import ApiError, TwinClient, Unreachable
 from service.schemas import Job
-from twin_core.errors import TwinError
 from twin_core.fem.demo import demo_scenario
 from twin_core.fem.hidden.base import WHERE_KEYS
 from twin_core.fem.scenario import Scenario
@@ -31,6 +30,10 @@ HOLDOUT = 0.3
 
 Place = tuple[str, frozenset[tuple[str, frozenset[str]]]]
 """An effect's name and where it acts, for comparison: pairs have no order."""
+
+
+class StepFailed(Exception):
+    """A step of the demonstration ran and did not succeed; the message says in one line which and why."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,9 @@ def run_demo(effect: str, seed: int, out: Path) -> Iterator[Outcome]:
     Raises
     ------
     TwinError, ReplayError
-        If the effect is unknown, a file cannot be written or a step of the service fails.
+        If the effect is unknown, a file cannot be written or the service does not answer.
+    StepFailed
+        If a job of the service fails.
     """
     begun = time.perf_counter()
     scenario, spec = demo_scenario(effect, seed)
@@ -131,15 +136,15 @@ def _replay(client: TwinClient, twin: str, path: Path) -> None:
     with progress_bar("replaying over HTTP") as progress:
         tally = play(recording, client, twin, progress=lambda t: progress(t.sent / t.total, f"{t.sent} samples"))
     if tally.accepted != tally.total:
-        raise TwinError(f"the service took {tally.accepted} of {tally.total} samples")
+        raise StepFailed(f"the service took {tally.accepted} of {tally.total} samples")
 
 
 def _finish(client: TwinClient, twin: str, job: Job, title: str) -> Job:
-    """Return a job once it succeeded; TwinError with its message if it did not."""
+    """Return a job once it succeeded; StepFailed with its message if it did not."""
     with progress_bar(title) as progress:
         job = client.wait(twin, job, on_progress=lambda j: progress(j.progress, j.message))
     if job.state != "succeeded":
-        raise TwinError(f"{job.kind} {job.state}: {job.message}")
+        raise StepFailed(f"{job.kind} {job.state}: {job.message}")
     return job
 
 
