@@ -175,7 +175,10 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
     values = {"T_room": world.room_K, "mode": world.mode}
     nodes, loads = [], []
     for i in range(world.n):
-        row: dict[str, Any] = {"id": f"n{i}", "capacity_J_per_K": {"guess": world.capacity[i] * np.exp(rng.normal(0, 0.3))}}
+        row: dict[str, Any] = {
+            "id": f"n{i}",
+            "capacity_J_per_K": {"guess": world.capacity[i] * np.exp(rng.normal(0, 0.3))},
+        }
         if i != unsensed:
             channels[f"T{i}"] = {"kind": "temperature", "unit": "K"}
             values[f"T{i}"] = truth[:, i] + rng.normal(0, noise, world.time_s.size)

@@ -149,9 +149,7 @@ def _readings(model: CalibratedModel, network: Network, record: Record) -> Float
     return measured
 
 
-def _prior(
-    network: Network, measured: FloatArray, record: Record, state: Json | None
-) -> tuple[FloatArray, FloatArray]:
+def _prior(network: Network, measured: FloatArray, record: Record, state: Json | None) -> tuple[FloatArray, FloatArray]:
     """Return mean and covariance of the first state."""
     n_nodes = len(network.nodes)
     if state is not None and state["nodes"] == list(network.nodes):

@@ -121,16 +121,14 @@ def _check(horizon_s: float, step_s: float, quantiles: Sequence[float]) -> None:
         raise ModelError(f"quantiles: must lie between 0 and 1, exclusive (got {wrong[0]})")
 
 
-def future_record(
-    spec: TwinSpec, record: Record, horizon_s: float, step_s: float, plan: Record | None
-) -> Record:
+def future_record(spec: TwinSpec, record: Record, horizon_s: float, step_s: float, plan: Record | None) -> Record:
     """Return inputs and boundary temperatures over the horizon: as planned, else the last value held.
 
     The first sample is the present. Planned samples that lie between the forecast's own times become times too.
     """
     now = float(record.time_s[-1])
     count = int(np.floor(horizon_s / step_s + 1e-9))
-    times = now + step_s * np.arange(count + 1)
+    times: FloatArray = now + step_s * np.arange(count + 1, dtype=np.float64)
     values: dict[str, FloatArray] = {}
     needed = [c for c in spec.used_channels if c not in spec.sensors or _is_boundary(spec, c)]
     for name in needed:

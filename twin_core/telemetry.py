@@ -44,7 +44,9 @@ class Record:
             raise TelemetryError(f"{self.name}: row {row}: time does not increase; sort the rows, drop repeated ones")
         for channel, column in self.values.items():
             if column.shape != self.time_s.shape:
-                raise TelemetryError(f"{self.name}: channel '{channel}' has {column.size} samples, time has {steps.size + 1}")
+                raise TelemetryError(
+                    f"{self.name}: channel '{channel}' has {column.size} samples, time has {steps.size + 1}"
+                )
 
     def channel(self, name: str) -> FloatArray:
         """Return one channel, (n_times,); TelemetryError if the record lacks it."""

@@ -219,7 +219,9 @@ def smoothed_states(
     stretched = np.full((forcing.n_steps + 1, problem.network.sensor_node.size), np.nan)
     read = nominal.segment.measured_K.copy()
     for term in problem.network.readings:
-        part = term.evaluate(nominal.segment.record.time_s, problem.network.parameters.values[problem.network.term_index(term)])
+        part = term.evaluate(
+            nominal.segment.record.time_s, problem.network.parameters.values[problem.network.term_index(term)]
+        )
         read[:, part.sensor] -= part.offset_K
     stretched[forcing.sample_step] = read
     smoothed = smooth(model, kalman_filter(model, stretched, keep="states"))
@@ -270,9 +272,7 @@ def _smoothing_pass(
 
 def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> tuple[Nominal, ...]:
     """Linearise every segment at other parameter values about the same temperatures and heat."""
-    return tuple(
-        linearise(problem, values, n.segment, _states(n), n.extra_W, n.steps.stages_K) for n in nominals
-    )
+    return tuple(linearise(problem, values, n.segment, _states(n), n.extra_W, n.steps.stages_K) for n in nominals)
 
 
 def _states(nominal: Nominal) -> FloatArray:
@@ -294,9 +294,7 @@ def gauss_newton_step(
     hessian = np.diag(1.0 / std**2)
     gradient = (free - parameters.free) / std**2
     for nominal in nominals:
-        columns = np.concatenate(
-            [parameter_columns(problem, values, nominal), nominal.residual_K[:, :, None]], axis=2
-        )
+        columns = np.concatenate([parameter_columns(problem, values, nominal), nominal.residual_K[:, :, None]], axis=2)
         whitened, _ = whiten(problem, latent, nominal, columns)
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]

@@ -102,7 +102,7 @@ def minimise(
         step = _limited(_step(hessian, gradient, damping), problem.logarithmic)
         predicted = -(gradient @ step + 0.5 * step @ hessian @ step)
         trial = problem.solve(x + step, fit)
-        gain = (fit.cost - trial.cost) / max(predicted, 1e-300) if np.isfinite(trial.cost) else -1.0
+        gain = (fit.cost - trial.cost) / max(float(predicted), 1e-300) if np.isfinite(trial.cost) else -1.0
         if gain > 1e-4:
             fall = (fit.cost - trial.cost) / max(fit.cost, 1e-300)
             x, fit, iterations = x + step, trial, iterations + 1

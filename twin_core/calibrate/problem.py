@@ -232,7 +232,9 @@ class Problem:
         mean, std = self.prior()
         hessian = np.diag(1.0 / std**2)
         gradient = (unknowns - mean) / std**2
-        for i, (block, residual) in enumerate(zip(self.jacobian_blocks(unknowns, fit), self.residuals(fit), strict=True)):
+        for i, (block, residual) in enumerate(
+            zip(self.jacobian_blocks(unknowns, fit), self.residuals(fit), strict=True)
+        ):
             valid = np.isfinite(residual)
             weight = np.broadcast_to(1.0 / self.noise_K, residual.shape)[valid]
             rows = block[valid] * weight[:, None]

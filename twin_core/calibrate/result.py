@@ -93,7 +93,9 @@ class CalibratedModel:
             Naming the field that is missing or wrong.
         """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
-            raise SpecError(f"format: not a model file of this program (expected '{FORMAT}'); make one with twin calibrate")
+            raise SpecError(
+                f"format: not a model file of this program (expected '{FORMAT}'); make one with twin calibrate"
+            )
         try:
             spec = load_spec(data["spec"])
             free_names = tuple(str(name) for name in data["free_names"])

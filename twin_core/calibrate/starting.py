@@ -22,19 +22,20 @@ MAX_LEVELS = 16
 
 
 def channel_levels(records: Sequence[Record], channel: str) -> tuple[float, ...]:
-    """Return the values at which a channel rests, ascending: samples closer than 2 % of the range are one level.
+    """Return the values at which a channel rests, ascending.
 
-    A level needs at least 0.5 % of the samples; what lies between (a slew) belongs to the nearest one.
+    Samples are counted in bins of 1 % of the range; neighbouring bins that hold at least 0.5 % of the samples each are
+    one level, its median. What lies between (a slew) belongs to the nearest level.
     """
     samples = np.concatenate([r.values[channel] for r in records if channel in r.values] or [np.zeros(0)])
-    samples = np.sort(samples[np.isfinite(samples)])
-    if samples.size == 0:
-        return ()
-    gap = 0.02 * (samples[-1] - samples[0])
-    groups = np.split(samples, np.flatnonzero(np.diff(samples) > gap) + 1)
-    rested = [g for g in groups if g.size >= 0.005 * samples.size] or groups
-    rested = sorted(rested, key=lambda g: g.size, reverse=True)[:MAX_LEVELS]
-    return tuple(sorted(float(np.median(g)) for g in rested))
+    samples = samples[np.isfinite(samples)]
+    if samples.size == 0 or samples.min() == samples.max():
+        return tuple(samples[:1].tolist())
+    bins = np.round((samples - samples.min()) / (0.01 * (samples.max() - samples.min()))).astype(np.int64)
+    rested = np.bincount(bins) >= max(0.005 * samples.size, 2)
+    group = np.where(rested, np.cumsum(np.diff(rested.astype(int), prepend=0) == 1), 0)[bins]
+    levels = [(int((group == g).sum()), float(np.median(samples[group == g]))) for g in range(1, group.max() + 1)]
+    return tuple(sorted(level for _, level in sorted(levels, reverse=True)[:MAX_LEVELS]))
 
 
 def table_levels(spec: TwinSpec, records: Sequence[Record]) -> dict[tuple[str, str], tuple[float, ...]]:
@@ -94,7 +95,7 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
     counts = np.diff(forcing.sample_step)
     stages = np.repeat(after[:-1], counts, axis=0)
     flat = np.repeat(stages[:, None], 2, axis=1)
-    boundaries = forcing.boundaries_K.reshape(-1, forcing.boundaries_K.shape[2])
+    boundaries = forcing.boundaries_flat_K(0, forcing.n_steps)
     along: Along = forcing.along(
         flat.reshape(-1, flat.shape[2]), fill_boundaries(network, values, boundaries), 0, forcing.n_steps
     )
@@ -105,12 +106,12 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
 
     def integrated(series: FloatArray) -> FloatArray:
         per_step = series.reshape(forcing.n_steps, 2).mean(axis=1) * forcing.step_s
-        return np.bincount(window, weights=per_step, minlength=n_windows)
+        return np.bincount(window, weights=per_step, minlength=n_windows).astype(np.float64)
 
     for term, index in zip(network.terms, network.term_indices, strict=True):
         part = term.evaluate(along, values[index])
         for entry in part.d_values:
-            design[:, entry.node, index[entry.index]] += integrated(entry.series)
+            design[:, entry.node, index[entry.item]] += integrated(entry.series)
     edges = np.searchsorted(window, np.arange(n_windows + 1))
     at_edges = temperatures[np.searchsorted(forcing.sample_step, edges)]
     for node, index in enumerate(network.capacity_index):

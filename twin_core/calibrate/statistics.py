@@ -35,9 +35,7 @@ def whiteness(residual: FloatArray) -> float | None:
     return float(np.mean((before[valid] - centre) * (after[valid] - centre))) / power if power > 0 else None
 
 
-def score(
-    sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Sequence[FloatArray]
-) -> dict[str, Any]:
+def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Sequence[FloatArray]) -> dict[str, Any]:
     """Return overall and per-sensor errors of one or several segments.
 
     Parameters

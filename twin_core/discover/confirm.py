@@ -1,15 +1,16 @@
 """Confirmation: a full refit with an effect in place, its evidence, and its error on blocks that it was not fitted to."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
 
 from twin_core._typing import FloatArray
-from twin_core.calibrate.latent_heat import HeatFit, fit_with_latent_heat
-from twin_core.calibrate.optimise import Optimum
+from twin_core.calibrate.latent_heat import HeatFit, first_size, fit_with_latent_heat, linearise, log_likelihood
+from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration, from_heat_fit
@@ -18,6 +19,9 @@ from twin_core.network.model import build_network
 
 N_BLOCKS = 8
 """Blocks of the training record that are predicted from the others."""
+
+FORWARD_SHARE = 0.35
+BURN_IN_SHARE = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,27 +38,70 @@ class Trial:
         Longest time step.
     near
         Open-loop optima of the same problem found otherwise.
+    simpler
+        The trial that this one extends: its open-loop optimum is a start too, so that a richer model never fits worse.
     """
 
     effects: tuple[Effect, ...]
     fit: HeatFit
     max_step_s: float
     near: tuple[Optimum, ...] = ()
+    simpler: "Trial | None" = None
 
     @cached_property
     def calibration(self) -> Calibration:
         """The same model calibrated on open-loop trajectories."""
-        return from_heat_fit(self.fit, self.max_step_s, near=self.near)
+        near = list(self.near)
+        if self.simpler is not None:
+            values = self.fit.network.parameters.as_dict()
+            near.append(minimise(self.fit.problem, carried_over(self.simpler.calibration, self.fit.problem, values)))
+        return from_heat_fit(self.fit, self.max_step_s, near=near)
+
+    @property
+    def present_effects(self) -> tuple[Effect, ...]:
+        """The effects at the values of the open-loop calibration."""
+        return fitted_effects(self.effects, self.calibration.network.parameters.as_dict())
 
     @cached_property
     def block_errors(self) -> FloatArray:
         """Sum of squared weighted errors on each block predicted from the others, (n_blocks,)."""
         return blocked_errors(self.calibration)
 
+    @cached_property
+    def forward_error(self) -> float:
+        """Sum of squared weighted errors over the end of the training record, predicted by a fit to its beginning."""
+        return forward_error(self.calibration)
+
     @property
     def n_samples(self) -> int:
         """Number of readings that took part."""
         return int(sum(n.segment.valid.sum() for n in self.fit.nominals))
+
+
+def carried_over(base: Calibration, problem: Problem, effect_values: Mapping[str, float]) -> FloatArray:
+    """Return the unknowns of a richer problem at a simpler one's optimum, effects at given values.
+
+    Parameters
+    ----------
+    base
+        The simpler calibration of the same telemetry.
+    problem
+        The richer problem.
+    effect_values
+        Full parameter name -> value, for what the simpler one lacks.
+    """
+    parameters = problem.network.parameters.updated(effect_values)
+    before = dict(zip(base.problem.network.parameters.free_names, base.optimum.unknowns, strict=False))
+    unknowns = problem.start()
+    unknowns[: problem.n_free] = [
+        before.get(name, own) for name, own in zip(parameters.free_names, parameters.free, strict=True)
+    ]
+    like = {extra.name: extra.like for extra in problem.network.extra}
+    nodes = base.problem.network.nodes
+    source = [nodes.index(n if n in nodes else like[n]) for n in problem.network.nodes]
+    for i in range(len(problem.segments)):
+        unknowns[problem.start_columns(i)] = base.optimum.unknowns[base.problem.start_columns(i)][source]
+    return unknowns
 
 
 def fitted_effects(effects: Sequence[Effect], values: dict[str, float]) -> tuple[Effect, ...]:
@@ -75,7 +122,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     hessian, _ = problem.normal_equations(unknowns, calibration.optimum.fit)
     edges = np.linspace(0, residual.shape[0], N_BLOCKS + 1).astype(int)
     errors = np.zeros(N_BLOCKS)
-    for b, (first, last) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for b, (first, last) in enumerate(pairwise(edges.tolist())):
         valid = np.isfinite(residual[first:last])
         rows, left = jacobian[first:last][valid], residual[first:last][valid]
         rest = hessian - rows.T @ rows
@@ -85,6 +132,29 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         predicted = left + rows @ move
         errors[b] = float(predicted @ predicted)
     return errors
+
+
+def forward_error(calibration: Calibration) -> float:
+    """Return the open-loop error over the last part of the training record, after a refit to what comes before.
+
+    Later segments keep their first samples, so that their initial state is known; infinite where the refit fails.
+    """
+    problem = calibration.problem
+    rows = np.cumsum([0] + [s.measured_K.shape[0] for s in problem.segments])
+    cut = int((1.0 - FORWARD_SHARE) * rows[-1])
+    early, late = [], []
+    for segment, first in zip(problem.segments, rows[:-1], strict=True):
+        n_rows = segment.measured_K.shape[0]
+        kept = max(cut - first, int(BURN_IN_SHARE * n_rows), 3)
+        at_end = np.arange(n_rows)[:, None] >= kept
+        early.append(replace(segment, measured_K=np.where(at_end, np.nan, segment.measured_K)))
+        late.append(np.where(at_end, segment.measured_K, np.nan))
+    shortened = replace(problem, segments=tuple(early))
+    optimum = minimise(shortened, calibration.optimum.unknowns, near=calibration.optimum.fit)
+    if optimum.status == "no_solution":
+        return np.inf
+    errors = [(m - p) / problem.noise_K for m, p in zip(late, optimum.fit.predicted_K, strict=True)]
+    return float(sum(np.nansum(e**2) for e in errors))
 
 
 def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) -> Trial:
@@ -110,7 +180,48 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
         ]
     )
     fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=n_passes)
-    return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s)
+    return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
+
+
+def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
+    """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
+
+    None where the balance has no solution there. The latent heat is sized about the result, for a later look.
+    """
+    problem = extended(base.fit.problem, effects)
+    own = {p.name: p.value for effect in effects for p in effect.parameters()}
+    optimum = minimise(problem, carried_over(base.calibration, problem, own))
+    if optimum.status == "no_solution":
+        return None
+    fit = about_trajectory(problem, optimum)
+    values = fit.network.parameters.as_dict()
+    return Trial(fitted_effects(effects, values), fit, base.max_step_s, (optimum,))
+
+
+def resettled(trial: Trial) -> Trial:
+    """Return a trial that was fitted on trajectories with its parameters fitted in the presence of latent heat too."""
+    calibration = trial.calibration
+    free = calibration.optimum.unknowns[: calibration.problem.n_free]
+    fit = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
+    return replace(trial, fit=fit, near=(calibration.optimum,), simpler=None)
+
+
+def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:
+    """Return a problem linearised about its open-loop optimum instead of the measured temperatures."""
+    free = optimum.unknowns[: problem.n_free]
+    values = problem.network.parameters.to_values(free)
+    nominals = tuple(
+        linearise(
+            problem,
+            values,
+            segment,
+            np.concatenate([path.start_K[None], path.stages_K[:, 1]]),
+            np.zeros((segment.forcing.n_steps, problem.n_nodes)),
+        )
+        for segment, path in zip(problem.segments, optimum.fit.trajectories, strict=True)
+    )
+    latent = first_size(problem, nominals)
+    return HeatFit(problem, free, latent, nominals, log_likelihood(problem, latent, nominals))
 
 
 def extended(declared: Problem, effects: Sequence[Effect]) -> Problem:
@@ -148,16 +259,32 @@ class Validation:
         Open-loop error after over before (rms).
     blocks_better
         Share of blocks whose error fell.
+    forward_ratio
+        The same for the end of the training record, after a refit to its beginning: does the effect extrapolate?
+    removed_share
+        Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
     """
 
     ratio: float
     blocks_better: float
+    forward_ratio: float
+    removed_share: float
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return what the likelihood says for the rich trial, chosen among ``n_tried`` candidates."""
+    """Return what the likelihood in the presence of latent heat says for the rich trial, chosen among ``n_tried``."""
+    return _evidence(rich.fit.log_posterior - simple.fit.log_posterior, simple, rich, n_tried)
+
+
+def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+    """Return what open-loop residuals say for the rich trial, each model under its own coloured residual noise."""
+    gain = rich.calibration.whitener.log_likelihood - simple.calibration.whitener.log_likelihood
+    return _evidence(gain, simple, rich, n_tried)
+
+
+def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+    """Return evidence from a gain in log-likelihood: every parameter and every candidate tried is paid for."""
     extra = max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)
-    gain = rich.fit.log_posterior - simple.fit.log_posterior
     penalty = 0.5 * extra * np.log(max(rich.n_samples, 2)) + np.log(max(n_tried, 1))
     p_value = min(1.0, max(n_tried, 1) * float(chi2.sf(2.0 * max(gain, 0.0), extra)))
     return Evidence(float(gain - penalty), p_value)
@@ -167,4 +294,13 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
     before, after = simple.block_errors, rich.block_errors
     ratio = float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
-    return Validation(ratio, float(np.mean(after < before)))
+    forward = float(np.sqrt(rich.forward_error / max(simple.forward_error, 1e-300)))
+    return Validation(ratio, float(np.mean(after < before)), forward, _removed_share(simple, rich))
+
+
+def _removed_share(simple: Trial, rich: Trial) -> float:
+    """Return the misfit that the rich trial removes as a share of the spread of the measured temperatures."""
+    measured = np.concatenate([s.measured_K for s in simple.fit.problem.segments])
+    before, after = (np.concatenate(t.calibration.residuals) for t in (simple, rich))
+    removed = float(np.nanmean(before**2) - np.nanmean(after**2))
+    return float(np.sqrt(max(removed, 0.0) / max(float(np.nanmean(np.nanvar(measured, axis=0))), 1e-300)))

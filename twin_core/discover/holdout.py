@@ -92,7 +92,9 @@ def split_burn_in(record: Record, burn_in_s: float | None) -> HeldOut:
     last = max(last, 1)
     if record.time_s.size - last < 2:
         raise TelemetryError(f"{record.name}: nothing is left to score after a burn-in of {seconds:g} s")
-    return HeldOut(record.take(np.arange(record.time_s.size) < last), record.take(np.arange(record.time_s.size) >= last - 1))
+    return HeldOut(
+        record.take(np.arange(record.time_s.size) < last), record.take(np.arange(record.time_s.size) >= last - 1)
+    )
 
 
 @dataclass(frozen=True)

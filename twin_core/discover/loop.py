@@ -77,10 +77,8 @@ def close_loop(
     fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
-    found = search(
-        base, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m)
-    )
-    after = to_model(found.trial.calibration, found.trial.effects) if found.findings else before
+    found = search(base, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m))
+    after = to_model(found.trial.calibration, found.trial.present_effects) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found, false_alarm_rate))
@@ -111,7 +109,9 @@ def verdict_of(found: Search, false_alarm_rate: float) -> str:
         return "effect_added"
     needed = threshold(false_alarm_rate)
     hinted = any(judged.evidence.log_bayes_factor > needed for judged in found.rejected)
-    return "unexplained" if hinted and misfit_share(found.base.calibration) > UNEXPLAINED_SHARE else "no_effect_supported"
+    return (
+        "unexplained" if hinted and misfit_share(found.base.calibration) > UNEXPLAINED_SHARE else "no_effect_supported"
+    )
 
 
 def misfit_share(calibration: Calibration) -> float:

@@ -82,7 +82,7 @@ def _temperatures(
         modelled = [[fit, *rest] for fit, rest in zip(fits, modelled, strict=True)]
     time_s = np.concatenate(times[:2] if follows else times[:1])
     keep = _thin(time_s.size)
-    columns = [np.concatenate((m[:2] if follows else m[:1]))[keep] for m in (measured, *modelled)]
+    columns = [np.concatenate(m[:2] if follows else m[:1])[keep] for m in (measured, *modelled)]
     return {
         "time": _axis(held[0].scored, time_s[keep]),
         "holdout_start": _axis(held[0].scored, predictions[0][0].time_s[:1])[0],
@@ -167,9 +167,7 @@ def _effect_heat(search: Search, node: str, states_K: FloatArray) -> FloatArray 
 def _network(model: CalibratedModel) -> Json:
     """Return the network as a drawing needs it."""
     spec, values = model.spec, model.values
-    conductors: list[list[Any]] = [
-        [*c.between, values[f"G:{c.between[0]}|{c.between[1]}"]] for c in spec.conductors
-    ]
+    conductors: list[list[Any]] = [[*c.between, values[f"G:{c.between[0]}|{c.between[1]}"]] for c in spec.conductors]
     return {
         "nodes": [node.id for node in spec.nodes],
         "boundaries": list(spec.boundaries),

@@ -9,8 +9,8 @@ from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import acceptance
 from twin_core.calibrate.statistics import residual_whiteness, score
-from twin_core.discover.search import Finding, Judged, Search
 from twin_core.discover.holdout import HeldOut, Prediction
+from twin_core.discover.search import Finding, Judged, Search
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
 
@@ -43,7 +43,12 @@ def evidence_json(judged: Judged) -> Json:
     """Return what speaks for an effect."""
     row: Json = {"log_bayes_factor": judged.evidence.log_bayes_factor, "p_value": judged.evidence.p_value}
     if judged.validation is not None:
-        row |= {"validation_ratio": judged.validation.ratio, "blocks_better": judged.validation.blocks_better}
+        row |= {
+            "validation_ratio": judged.validation.ratio,
+            "blocks_better": judged.validation.blocks_better,
+            "forward_ratio": judged.validation.forward_ratio,
+            "removed_share": judged.validation.removed_share,
+        }
     return row
 
 

@@ -6,13 +6,27 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin_core._typing import Progress
-from twin_core.discover.confirm import Evidence, Trial, Validation, try_effects, validate, weigh
+from twin_core.calibrate.latent_heat import HeatFit
+from twin_core.discover.confirm import (
+    Evidence,
+    Trial,
+    Validation,
+    about_trajectory,
+    resettled,
+    try_effects,
+    try_on_trajectories,
+    validate,
+    weigh,
+    weigh_trajectories,
+)
 from twin_core.discover.screen import Probe, Screening, joint_gain, screen, survey_of
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, Survey
 
 MAX_FINDINGS = 4
 N_REFITS = 12
+N_TRAJECTORY_REFITS = 6
+TRAJECTORY_SHARES = (1.0, 0.1, 0.01)
 LATENT_SHARES = (1.0, 0.1, 0.01)
 """Sizes of the latent heat at which candidates are screened, as shares of the fitted one."""
 
@@ -23,6 +37,15 @@ N_VALIDATED = 3
 ALTERNATIVE_NATS = 3.0
 VALIDATION_GAIN = 0.97
 """An effect must lower the error on blocks that it was not fitted to by 3 % at least, or it is not worth its name."""
+
+FORWARD_LIMIT = 1.02
+"""Nor may it make the end of the training record worse when it is fitted to the beginning alone."""
+
+DECISIVE_FORWARD, TOLERATED_BLOCKS = 0.7, 2.0
+"""Where one event tells all, blocks tell little: an effect that lowers the forward error by 30 % may then double theirs."""
+
+LUMPING_SHARE = 0.005
+"""What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
 
 @dataclass(frozen=True)
@@ -63,16 +86,9 @@ def threshold(false_alarm_rate: float) -> float:
     return float(np.log(1.0 / false_alarm_rate))
 
 
-def screened(trial: Trial, *, fallback: bool) -> list[Screening]:
-    """Screen every candidate effect at every place and setting that the trial does not have yet.
-
-    Returns
-    -------
-    list of Screening
-        One per assumed size of the latent heat: as fitted, where it explains everything a little, and smaller, as it
-        would be if the right effect were in place.
-    """
-    survey = survey_of(trial.fit)
+def candidates(trial: Trial, fit: HeatFit, *, fallback: bool) -> tuple[Survey, list[Effect]]:
+    """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks."""
+    survey = survey_of(fit)
     taken = {effect.place for effect in trial.effects}
     effects = [
         effect
@@ -82,17 +98,25 @@ def screened(trial: Trial, *, fallback: bool) -> list[Screening]:
         for effect in kind.starts(where, survey)
         if effect.place not in taken
     ]
-    latent = trial.fit.latent
-    sized = [replace(trial.fit, latent=replace(latent, std_W=share * latent.std_W)) for share in LATENT_SHARES]
-    return [screen(fit, survey, effects) for fit in sized]
+    return survey, effects
 
 
-def shortlist(rankings: Sequence[Sequence[Probe]], needed: float) -> list[Effect]:
+def screened(trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: bool) -> list[Screening]:
+    """Screen the candidates of a trial about a fit, once per assumed size of the latent heat.
+
+    As fitted, the latent heat explains everything a little; smaller, it is as it would be with the right effect in place.
+    """
+    survey, effects = candidates(trial, fit, fallback=fallback)
+    sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
+    return [screen(one, survey, effects) for one in sized]
+
+
+def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int) -> list[Effect]:
     """Return the effects worth a refit: the best of every ranking in turn, each place once."""
     chosen: dict[object, Effect] = {}
-    for rank in range(N_REFITS):
+    for rank in range(n_wanted):
         for ranked in rankings:
-            if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < N_REFITS:
+            if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:
                 chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
     return list(chosen.values())
 
@@ -140,14 +164,41 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported."""
-    screenings = screened(state.trial, fallback=fallback)
+    if _extend_by_heat(state, needed, fallback=fallback):
+        return True
+    return _extend_by_trajectory(state, needed, fallback=fallback)
+
+
+def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
+    """Extend by what the innovations say, in the presence of latent heat."""
+    screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = max(len(ranked) for ranked in rankings)
-    singles = [(effect,) for effect in shortlist(rankings, needed)]
-    if _accept(state, singles, n_tried, needed):
+    singles = [(effect,) for effect in shortlist(rankings, needed, N_REFITS)]
+    if _accept(state, _by_heat(state, singles, n_tried), needed):
         return True
     pairs = [] if fallback else _best_pairs(rankings[0], screenings[0], needed)
-    return _accept(state, pairs, max(n_tried**2 // 2, 1), needed)
+    return _accept(state, _by_heat(state, pairs, max(n_tried**2 // 2, 1)), needed)
+
+
+def _extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
+    """Extend by what open-loop residuals say: the second look, where misfit is too large for the first."""
+    calibration = state.trial.calibration
+    fit = about_trajectory(calibration.problem, calibration.optimum)
+    screenings = screened(state.trial, fit, TRAJECTORY_SHARES, fallback=fallback)
+    rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
+    n_tried = max(len(ranked) for ranked in rankings)
+    options = [(effect,) for effect in shortlist(rankings, needed, N_TRAJECTORY_REFITS)]
+    judged = []
+    for option in options:
+        trial = try_on_trajectories(state.trial, (*state.trial.present_effects, *option))
+        if trial is not None:
+            found = trial.effects[len(state.trial.effects) :]
+            judged.append(Judged(found, weigh_trajectories(state.trial, trial, n_tried), trial))
+    if not _accept(state, judged, needed):
+        return False
+    state.trial = resettled(state.trial)
+    return True
 
 
 def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) -> list[tuple[Effect, ...]]:
@@ -163,33 +214,43 @@ def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) ->
     return [pair for _, pair in scored[:N_PAIR_REFITS]]
 
 
-def _accept(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int, needed: float) -> bool:
-    """Refit every option, keep the best that passes evidence and validation; False if none does."""
-    judged = [_judge(state, state.trial, option, n_tried, n_passes=3) for option in options]
-    judged.sort(key=_worth)
+def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
+    """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
+    judged = sorted((_judge(state, state.trial, option, n_tried, n_passes=3) for option in options), key=_worth)
     near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > judged[0].evidence.log_bayes_factor - 40.0]
-    settled = [_judge(state, j.trial, j.effects, n_tried, n_passes=15) for j in near]
-    judged = sorted([*settled, *judged[len(near) :]], key=_worth)
-    for best in judged[:N_VALIDATED]:
-        if best.evidence.log_bayes_factor <= needed:
-            break
-        validation = validate(state.trial, best.trial)
-        if validation.ratio < VALIDATION_GAIN:
-            close = [j for j in judged if j is not best and _is_close(j, best)]
-            state.trial = best.trial
-            own = Judged(best.effects, best.evidence, best.trial, validation)
-            state.findings.append(Finding(own, tuple(close)))
-            return True
-        state.rejected.append(Judged(best.effects, best.evidence, best.trial, validation))
-    state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
-    return False
+    return [*(_judge(state, j.trial, j.effects, n_tried, n_passes=15) for j in near), *judged[len(near) :]]
 
 
 def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:
     """Fit an option on top of the state's effects, started from a trial close by."""
-    trial = try_effects(start, (*state.trial.effects, *option), n_passes=n_passes)
+    trial = replace(try_effects(start, (*state.trial.effects, *option), n_passes=n_passes), simpler=state.trial)
     found = trial.effects[len(state.trial.effects) :]
     return Judged(found, weigh(state.trial, trial, n_tried), trial)
+
+
+def _accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
+    """Keep the best option that passes evidence and validation; False if none does."""
+    judged = sorted(options, key=_worth)
+    for best in judged[:N_VALIDATED]:
+        if best.evidence.log_bayes_factor <= needed:
+            break
+        validation = validate(state.trial, best.trial)
+        own = Judged(best.effects, best.evidence, best.trial, validation)
+        if is_valid(validation):
+            close = [j for j in judged if j is not best and _is_close(j, best)]
+            state.trial = best.trial
+            state.findings.append(Finding(own, tuple(close)))
+            return True
+        state.rejected.append(own)
+    state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
+    return False
+
+
+def is_valid(validation: Validation) -> bool:
+    """Return whether an effect helps where it was not fitted, by an amount that a lumped network can judge."""
+    blocks = validation.ratio < VALIDATION_GAIN and validation.forward_ratio < FORWARD_LIMIT
+    forward = validation.forward_ratio < DECISIVE_FORWARD and validation.ratio < TOLERATED_BLOCKS
+    return (blocks or forward) and validation.removed_share > LUMPING_SHARE
 
 
 def _worth(judged: Judged) -> float:
@@ -205,7 +266,7 @@ def _prune(state: Search, needed: float) -> None:
     """Drop findings that a later one has made superfluous."""
     for finding in list(state.findings[:-1]):
         kept = [f for f in state.findings if f is not finding]
-        without = try_effects(state.trial, [e for f in kept for e in _present(state, f)])
+        without = try_effects(state.trial, [e for f in kept for e in _present(state, f)], n_passes=10)
         if weigh(without, state.trial, 1).log_bayes_factor <= needed:
             state.trial, state.findings = without, kept
 

@@ -6,6 +6,7 @@ Adding one is one file with a subclass, and one line in the registry of ``twin_c
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -76,7 +77,7 @@ class Survey:
 
     def segments(self) -> Iterable[slice]:
         """Yield the points of each segment."""
-        yield from (slice(a, b) for a, b in zip(self.segment_edges[:-1], self.segment_edges[1:], strict=True))
+        yield from (slice(a, b) for a, b in pairwise(self.segment_edges))
 
 
 @dataclass(frozen=True)
@@ -191,8 +192,8 @@ class Effect(ABC):
             own = [p.name for p in term.parameters]
             numbers = np.array([self._null_value(name) for name in own] + [1.0] * len(term.borrows))
             for entry in term.evaluate(survey.along, numbers).d_values:
-                if entry.index < len(own) and own[entry.index] in wanted:
-                    columns[wanted[own[entry.index]]].append((entry.node, entry.series))
+                if entry.item < len(own) and own[entry.item] in wanted:
+                    columns[wanted[own[entry.item]]].append((entry.node, entry.series))
         return columns
 
     def unit_readings(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
@@ -213,7 +214,9 @@ def require(where: Where, keys: tuple[str, ...], effect: str) -> None:
         value = where[key]
         pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(v, str) for v in value)
         if (key == "nodes" and not pair) or (key != "nodes" and not isinstance(value, str)):
-            raise ModelError(f"effect {effect}: where.{key} must be {'a pair of nodes' if key == 'nodes' else 'a name'}")
+            raise ModelError(
+                f"effect {effect}: where.{key} must be {'a pair of nodes' if key == 'nodes' else 'a name'}"
+            )
     for key in where:
         if key not in keys:
             raise ModelError(f"effect {effect}: where.{key} is not one of {', '.join(keys)}")

@@ -83,11 +83,11 @@ def evaluate_balance(
         heat[:, nodes] += part.heat_W
         jacobian[:, nodes[:, None], nodes[None, :]] += part.d_temperature
         if derivatives:
-            entries += [Entry(int(index[e.index]), e.node, e.series) for e in part.d_values]
+            entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
             entries += [
-                Entry(int(network.boundary_index[e.index]), e.node, e.series)
+                Entry(int(network.boundary_index[e.item]), e.node, e.series)
                 for e in part.d_boundaries
-                if network.boundary_index[e.index] >= 0
+                if network.boundary_index[e.item] >= 0
             ]
     capacity, slope, capacity_entries = _capacities(network, values, along)
     rate = heat / capacity
@@ -97,8 +97,8 @@ def evaluate_balance(
     if not derivatives:
         nothing = np.zeros(0, dtype=np.int64)
         return Balance(rate, jacobian, heat, capacity, nothing, nothing, np.zeros((0, n_points)))
-    rows = [Entry(e.index, e.node, e.series / capacity[:, e.node]) for e in entries]
-    rows += [Entry(e.index, e.node, -e.series * rate[:, e.node] / capacity[:, e.node]) for e in capacity_entries]
+    rows = [Entry(e.item, e.node, e.series / capacity[:, e.node]) for e in entries]
+    rows += [Entry(e.item, e.node, -e.series * rate[:, e.node] / capacity[:, e.node]) for e in capacity_entries]
     return _free_entries(network, values, rate, jacobian, heat, capacity, rows)
 
 
@@ -114,7 +114,7 @@ def _capacities(network: Network, values: FloatArray, along: Along) -> tuple[Flo
         part = term.evaluate(along, values[index])
         capacity[:, part.node] += part.extra_J_per_K
         slope[:, part.node] += part.d_temperature
-        entries += [Entry(int(index[e.index]), e.node, e.series) for e in part.d_values]
+        entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
     return capacity, slope, entries
 
 
@@ -132,8 +132,8 @@ def _free_entries(
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
     at = parameters.at_values(values)
     slopes = {int(i): at.parameters[i].transform.slope(at.parameters[i].free) for i in parameters.free_index}
-    kept = [row for row in rows if row.index in position]
-    series = np.array([slopes[row.index] * row.series for row in kept]).reshape(len(kept), rate.shape[0])
-    free = np.array([position[row.index] for row in kept], dtype=np.int64)
+    kept = [row for row in rows if row.item in position]
+    series = np.array([slopes[row.item] * row.series for row in kept]).reshape(len(kept), rate.shape[0])
+    free = np.array([position[row.item] for row in kept], dtype=np.int64)
     node = np.array([row.node for row in kept], dtype=np.int64)
     return Balance(rate, jacobian, heat, capacity, free, node, series)

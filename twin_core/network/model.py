@@ -246,10 +246,13 @@ def build_network(
         _quantity(f"C:{node.id}", "J/K", node.capacity_J_per_K, 1.0e4) for node in spec.nodes
     ]
     parameters += [
-        real(f"T:{name}", "K", b.guess_K, prior_std=50.0) for name, b in spec.boundaries.items() if b.guess_K is not None
+        real(f"T:{name}", "K", b.guess_K, prior_std=50.0)
+        for name, b in spec.boundaries.items()
+        if b.guess_K is not None
     ]
     parameters += [node.capacity for node in extra]
-    parameters += [p for term in (*terms, *capacities, *readings) for p in term.parameters]
+    for group in (terms, capacities, readings):
+        parameters += [p for term in group for p in term.parameters]
     unique = tuple({p.name: p for p in parameters}.values())
     reads = {node.reads: layout.node(node.name) for node in extra if node.reads is not None}
     sensor_node = [reads.get(s, layout.node(layout.sensor_node(s))) for s in spec.sensors]
@@ -313,8 +316,8 @@ def _load_term(layout: Layout, load: Load) -> Term:
     unknown = load.gain is not None or channel.unit != "W"
     unit = "W/%" if channel.unit == "percent" else ""
     gain = (
-        _quantity(gain_name(load), unit, load.gain, 1.0) if unknown else positive(gain_name(load), unit, 1.0, frozen=True)
+        _quantity(gain_name(load), unit, load.gain, 1.0)
+        if unknown
+        else positive(gain_name(load), unit, 1.0, frozen=True)
     )
     return ChannelLoad(node, load.channel, load.weight, load.solar, (gain,))
-
-

@@ -38,9 +38,9 @@ class Along:
 
 
 class Entry(NamedTuple):
-    """A derivative series: of the quantity at ``node`` (its position in the network) with respect to item ``index``."""
+    """A derivative series: of the quantity at ``node`` (its position in the network) with respect to an item."""
 
-    index: int
+    item: int
     node: int
     series: FloatArray
 
@@ -57,9 +57,9 @@ class Heat:
     d_temperature : (n_points or 1, n_local, n_local)
         d heat_W[:, a] / d temperature of nodes[b].
     d_values
-        Entries whose index counts the term's ``parameters`` first, then what it ``borrows``.
+        Entries whose item counts the term's ``parameters`` first, then what it ``borrows``.
     d_boundaries
-        Entries whose index is the boundary.
+        Entries whose item is the boundary.
     """
 
     nodes: tuple[int, ...]
@@ -72,8 +72,15 @@ class Heat:
 class Term(Protocol):
     """A heat flow. ``values`` are its own parameters followed by those it borrows from the network by name."""
 
-    parameters: tuple[Parameter, ...]
-    borrows: tuple[str, ...]
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its own parameters."""
+        ...
+
+    @property
+    def borrows(self) -> tuple[str, ...]:
+        """Names of network parameters that it needs too."""
+        ...
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
         """Return heat and derivatives at the given points."""
@@ -93,8 +100,15 @@ class Capacity:
 class CapacityTerm(Protocol):
     """A temperature-dependent addition to the capacity of one node."""
 
-    parameters: tuple[Parameter, ...]
-    borrows: tuple[str, ...]
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its own parameters."""
+        ...
+
+    @property
+    def borrows(self) -> tuple[str, ...]:
+        """Names of network parameters that it needs too."""
+        ...
 
     def evaluate(self, along: Along, values: FloatArray) -> Capacity:
         """Return the extra capacity and derivatives at the given points."""
@@ -113,8 +127,15 @@ class Reading:
 class ReadingTerm(Protocol):
     """A fault of one sensor, as an offset over time."""
 
-    parameters: tuple[Parameter, ...]
-    borrows: tuple[str, ...]
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its own parameters."""
+        ...
+
+    @property
+    def borrows(self) -> tuple[str, ...]:
+        """Names of network parameters that it needs too."""
+        ...
 
     def evaluate(self, time_s: FloatArray, values: FloatArray) -> Reading:
         """Return the offset and derivatives at the sample times."""

@@ -1,6 +1,6 @@
 """One parameter: its value, unit, transform and prior."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from twin_core.parameters.transforms import Identity, Log, LogInterval, Transform
 
@@ -30,7 +30,7 @@ class Parameter:
     name: str
     unit: str
     value: float
-    transform: Transform = Log()
+    transform: Transform = field(default_factory=Log)
     prior_std: float | None = None
     frozen: bool = False
     guessed: bool = False
@@ -63,7 +63,7 @@ def positive(
     guessed: bool = False,
 ) -> Parameter:
     """Return a parameter that is positive (and within ``bounds``) by construction."""
-    transform: Transform = Log() if bounds is None else LogInterval(*bounds)
+    transform: Transform = field(default_factory=Log) if bounds is None else LogInterval(*bounds)
     return Parameter(name, unit, value, transform, prior_std, frozen, guessed)
 
 

@@ -62,7 +62,7 @@ class Forcing:
         )
 
 
-def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *, interval: FloatArray) -> FloatArray:
+def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *, interval: IntArray) -> FloatArray:
     """Return a channel at the stages: the sample that opens their interval where held, else interpolated.
 
     Missing samples hold the last one (or are bridged by interpolation); before the first sample its value is taken.

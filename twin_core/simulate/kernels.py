@@ -76,7 +76,9 @@ def _prepare(lu: FloatArray, pivots: IntArray, scaled_step: float, jacobian: Flo
 
 
 @njit(cache=True)
-def march(step_s: FloatArray, jacobian: FloatArray, constant: FloatArray, start: FloatArray, gamma: float) -> FloatArray:
+def march(
+    step_s: FloatArray, jacobian: FloatArray, constant: FloatArray, start: FloatArray, gamma: float
+) -> FloatArray:
     """Advance the linearised balance.
 
     Parameters
