@@ -63,7 +63,7 @@ def positive(
     guessed: bool = False,
 ) -> Parameter:
     """Return a parameter that is positive (and within ``bounds``) by construction."""
-    transform: Transform = field(default_factory=Log) if bounds is None else LogInterval(*bounds)
+    transform: Transform = Log() if bounds is None else LogInterval(*bounds)
     return Parameter(name, unit, value, transform, prior_std, frozen, guessed)
 
 
