@@ -10,7 +10,7 @@ from twin_core.errors import ModelError
 from twin_core.gp.kernels import Values
 
 SAME = 1e-12
-"""Relative difference below which the Jacobians of all steps count as one (a linear network)."""
+"""Relative difference below which the Jacobians (or capacities) of all steps count as one (a linear network)."""
 
 
 @dataclass(frozen=True)
@@ -94,12 +94,12 @@ class Linearised:
         if rate.shape != ends.shape:
             raise ModelError(f"rate_K_per_s has shape {rate.shape}, nominal_K asks for {ends.shape}")
         constant = rate - (ends @ np.swapaxes(jacobian, -1, -2))
-        return cls(times, jacobian, constant, np.atleast_2d(capacity_J_per_K))
+        return cls(times, jacobian, constant, _collapse(np.atleast_2d(capacity_J_per_K)))
 
 
-def _collapse(jacobian: Values) -> Values:
-    """Keep one Jacobian where all steps share it: a linear network needs one discretisation per distinct step."""
-    if jacobian.shape[0] < 2:
-        return jacobian
-    spread = np.abs(jacobian - jacobian[0]).max()
-    return jacobian[:1] if spread <= SAME * np.abs(jacobian[0]).max() else jacobian
+def _collapse(stack: Values) -> Values:
+    """Keep one array where all steps share it: a linear network needs one discretisation per distinct step."""
+    if stack.shape[0] < 2:
+        return stack
+    spread = np.abs(stack - stack[0]).max()
+    return stack[:1] if spread <= SAME * np.abs(stack[0]).max() else stack
