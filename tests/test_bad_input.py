@@ -132,6 +132,8 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
     (HEAD.replace("time", "time_s") + "soon,20,293,5\n", "row 2: column 'time_s' holds 'soon'"),
     (HEAD + '2026-01-01T00:00:00Z,"20,293,5\n', "row 2: "),
     (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples"),
+    (HEAD + "2026-01-01T00:00:00Z,20,,5\n2026-01-01T00:01:00Z,20,,5\n", "channel 'T_b' has no samples"),
+    (HEAD + "2026-01-01T00:00:00Z,20,293,\n2026-01-01T00:01:00Z,20,293,\n", "channel 'Q_a' has no samples"),
 ]
 
 ARGUMENTS: list[tuple[str, str]] = [
@@ -179,6 +181,7 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv", "step_s: must be positive"),
     ("forecast --model model.json --telemetry data.csv copy.csv --horizon 60 --out x.csv", "copy.csv: a forecast"),
     ("forecast --model model.json --telemetry data.csv --horizon 60 --out x.txt", "x.txt: the name must end in"),
+    ("forecast --model model.json --telemetry one.csv --horizon 60 --out x.csv", "one.csv: holds one sample"),
     ("replay absent.mcap --url http://127.0.0.1:9 --twin x", "absent.mcap: cannot be read"),
     ("replay broken.mcap --url http://127.0.0.1:9 --twin x", "broken.mcap: not a complete MCAP file"),
     ("replay broken.mcap --url localhost --twin x", "--url must begin with http://"),
@@ -241,6 +244,7 @@ def desk(
     (tmp_path / "data.txt").write_text(pair_telemetry(40))
     (tmp_path / "copy.csv").write_text(pair_telemetry(40))
     (tmp_path / "undated.csv").write_text("time_s,T_a,T_b,Q_a\n0,20,293,5\n")
+    (tmp_path / "one.csv").write_text(pair_telemetry(1))
     (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(40))
     monkeypatch.chdir(tmp_path)
     capsys.readouterr()

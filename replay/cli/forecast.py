@@ -50,6 +50,8 @@ def forecast(
         raise TelemetryError(f"{telemetry[1]}: a forecast starts at the end of one file; name one")
     model = load_model(model_file)
     record = load_record(telemetry[0], model.spec)
+    if step is None and record.time_s.size < 2:
+        raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
     planned = _load_plan(plan, record, model) if plan else None
     result = look_ahead(model, record, horizon, step_s=step, plan=planned)
     document = _document(result, record, model)

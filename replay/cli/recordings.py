@@ -60,7 +60,19 @@ def load_records(paths: Sequence[Path], spec: TwinSpec) -> list[Record]:
         if (record.epoch_ns is None) != (records[0].epoch_ns is None):
             raise TelemetryError(f"{record.name}: {_form(record)}, {records[0].name} {_form(records[0])}; use one form")
         check_exclude(spec, record)
+    if records:
+        _check_sampled(spec, records)
     return records
+
+
+def _check_sampled(spec: TwinSpec, records: Sequence[Record]) -> None:
+    """Refuse a channel of which no file holds a sample."""
+    for channel in spec.used_channels:
+        if not any(np.isfinite(record.values[channel]).any() for record in records):
+            names = ", ".join(record.name for record in records)
+            raise TelemetryError(
+                f"{names}: channel '{channel}' has no samples; add them or remove it from the specification"
+            )
 
 
 def check_exclude(spec: TwinSpec, record: Record) -> None:
