@@ -58,7 +58,7 @@ def test_a_boundary_conductor_follows_the_difference() -> None:
     heat = BoundaryConductor(2, 1, (positive("G", "W/K", 3.0),)).evaluate(ALONG, np.array([3.0]))
     np.testing.assert_allclose(heat.heat_W[:, 0], [3.0 * 5.0, 3.0 * -10.0])
     assert heat.nodes == (2,)
-    assert [(e.index, e.node) for e in heat.d_boundaries] == [(1, 2)]
+    assert [(e.item, e.node) for e in heat.d_boundaries] == [(1, 2)]
 
 
 def test_radiation_by_the_fourth_power() -> None:
