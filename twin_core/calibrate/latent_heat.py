@@ -201,7 +201,7 @@ def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) ->
         balance.jacobian_per_s.reshape(-1, 2, n, n),
         balance.entry_free,
         balance.entry_node,
-        balance.entry_series.reshape(-1, forcing.n_steps, 2),
+        balance.entry_series.reshape(balance.entry_free.size, forcing.n_steps, 2),
         np.zeros((n, problem.n_free)),
         forcing.sample_step,
         network.sensor_node,

@@ -128,7 +128,7 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
                 jacobian,
                 np.array([r[0] for r in rows], dtype=np.int64),
                 np.array([r[1] for r in rows], dtype=np.int64),
-                np.array([r[2] for r in rows]).reshape(len(rows), -1, 2),
+                np.array([r[2] for r in rows]).reshape(len(rows), forcing.n_steps, 2),
                 np.zeros((n, len(some))),
                 forcing.sample_step,
                 network.sensor_node,

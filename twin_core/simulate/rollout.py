@@ -178,7 +178,7 @@ def sensitivities(
             balance.jacobian_per_s.reshape(-1, 2, n_nodes, n_nodes),
             balance.entry_free,
             balance.entry_node,
-            balance.entry_series.reshape(-1, last - first, 2),
+            balance.entry_series.reshape(balance.entry_free.size, last - first, 2),
             state,
             forcing.sample_step[low:high] - first,
             observed,
