@@ -1,0 +1,160 @@
+"""Effects that are a heat flow: the heat by hand, and where they may stand."""
+
+import math
+
+import numpy as np
+import pytest
+
+from tests.analytic import SIGMA
+from tests.helpers import every_term_network, points, survey_of
+from twin_core.effects import REGISTRY, Effect
+from twin_core.network.terms import Along
+
+ALONG = Along(
+    time_s=np.arange(3.0),
+    temperatures_K=np.array([[300.0, 280.0, 290.0], [310.0, 285.0, 260.0], [270.0, 285.0, 260.0]]),
+    boundaries_K=np.array([[3.0, 295.0, 255.0]] * 3),
+    inputs={
+        "Q_a": np.array([0.0, 25.0, 100.0]),
+        "H": np.array([50.0, 0.0, 10.0]),
+        "Q_sun": np.array([10.0, 20.0, 30.0]),
+        "pitch": np.array([45.0, 100.0, 140.0]),
+        "mode": np.array([0.0, 2.0, 1.0]),
+    },
+    sun_factor=np.array([1.0, 0.9, 1.1]),
+)
+
+
+def heat_W(effect: Effect) -> np.ndarray:
+    """Return the heat of an effect into the nodes a, b, c at the three points."""
+    network = every_term_network([effect])
+    named = network.parameters.as_dict()
+    found = np.zeros((3, 3))
+    for term in effect.addition(network.layout).terms:
+        part = term.evaluate(ALONG, np.array([named[n] for n in (*(p.name for p in term.parameters), *term.borrows)]))
+        found[:, list(part.nodes)] += part.heat_W
+    return found
+
+
+def test_radiation_to_sink() -> None:
+    found = heat_W(REGISTRY["radiation_to_sink"]({"node": "b", "sink": "room"}, {"R_m2": 0.25}))
+    expected = SIGMA * 0.25 * (295.0**4 - ALONG.temperatures_K[:, 1] ** 4)
+    np.testing.assert_allclose(found, np.outer(expected, [0.0, 1.0, 0.0]))
+
+
+def test_missing_conductor() -> None:
+    found = heat_W(REGISTRY["missing_conductor"]({"nodes": ["c", "a"]}, {"G_W_per_K": 2.0}))
+    np.testing.assert_allclose(found, 2.0 * np.outer([10.0, 50.0, 10.0], [-1.0, 0.0, 1.0]))
+
+
+def test_leak_to_boundary() -> None:
+    found = heat_W(REGISTRY["leak_to_boundary"]({"node": "c", "boundary": "room"}, {"G_W_per_K": 0.5}))
+    np.testing.assert_allclose(found[:, 2], [2.5, 17.5, 17.5])
+
+
+def test_constant_heat_load() -> None:
+    found = heat_W(REGISTRY["constant_heat_load"]({"node": "a"}, {"Q_W": -3.0}))
+    np.testing.assert_allclose(found, np.outer(np.full(3, -3.0), [1.0, 0.0, 0.0]))
+
+
+def test_channel_heat_load_by_levels() -> None:
+    values = {f"values_W[{i}]": v for i, v in enumerate((1.0, 5.0, 9.0))}
+    settings = {"knots": (0.0, 1.0, 2.0), "levels": True}
+    found = heat_W(REGISTRY["channel_heat_load"]({"node": "c", "channel": "mode"}, values, settings))
+    np.testing.assert_allclose(found[:, 2], [1.0, 9.0, 5.0])
+
+
+def test_channel_heat_load_by_knots() -> None:
+    values = {f"values_W[{i}]": v for i, v in enumerate((0.0, 10.0, 4.0))}
+    settings = {"knots": (60.0, 100.0, 120.0), "levels": False}
+    found = heat_W(REGISTRY["channel_heat_load"]({"node": "c", "channel": "pitch"}, values, settings))
+    np.testing.assert_allclose(found[:, 2], [0.0, 10.0, 4.0])  # held beyond the outer knots
+
+
+@pytest.mark.parametrize(("limit_W", "expected"), [(1e3, [0.0, 0.0, 60.0]), (45.0, [0.0, 0.0, 45.0])])
+def test_proportional_heater(limit_W: float, expected: list[float]) -> None:
+    values = {"k_W_per_K": 3.0, "T_set_K": 290.0, "Q_W": limit_W}
+    np.testing.assert_allclose(heat_W(REGISTRY["proportional_heater"]({"node": "a"}, values))[:, 0], expected)
+
+
+def test_input_gain_follows_every_load_of_its_channel() -> None:
+    found = heat_W(REGISTRY["input_gain"]({"channel": "Q_a"}, {"g": 0.7}))
+    np.testing.assert_allclose(found, -0.3 * np.outer([0.0, 25.0, 100.0], [0.6, 0.0, 0.4]), atol=1e-12)
+
+
+def test_input_gain_of_sunlight_follows_the_sun() -> None:
+    found = heat_W(REGISTRY["input_gain"]({"channel": "Q_sun"}, {"g": 1.5}))
+    np.testing.assert_allclose(found[:, 1], 0.5 * np.array([10.0, 18.0, 33.0]))
+
+
+def test_input_power_law() -> None:
+    found = heat_W(REGISTRY["input_power_law"]({"channel": "Q_a"}, {"n": 2.0}, {"reference": 50.0}))
+    delivered = np.array([0.0, 25.0, 100.0]) ** 2 / 50.0
+    np.testing.assert_allclose(found, np.outer(delivered - [0.0, 25.0, 100.0], [0.6, 0.0, 0.4]), atol=1e-9)
+
+
+def test_input_power_law_of_a_percentage_keeps_its_gain() -> None:
+    found = heat_W(REGISTRY["input_power_law"]({"channel": "H"}, {"n": 2.0}, {"reference": 100.0}))
+    np.testing.assert_allclose(found[:, 2], 0.4 * (np.array([25.0, 0.0, 1.0]) - [50.0, 0.0, 10.0]), atol=1e-9)
+
+
+def test_learned_heat_flow_is_held_beyond_what_it_has_seen() -> None:
+    values = {"coefficients[0]": 1.0, "coefficients[1]": 2.0, "coefficients[2]": 3.0}
+    settings = {"degree": 2, "centre_K": 290.0, "scale_K": 10.0, "reach": 1.5}
+    found = heat_W(REGISTRY["learned_heat_flow"]({"node": "a"}, values, settings))[:, 0]
+    x = np.array([1.0, 1.5, -1.5])
+    np.testing.assert_allclose(found, 1.0 + 2.0 * x + 3.0 * x**2)
+
+
+def places(name: str) -> list[dict]:
+    return list(REGISTRY[name].places(every_term_network().layout))
+
+
+def test_what_is_declared_is_no_place() -> None:
+    pairs = [set(where["nodes"]) for where in places("missing_conductor")]
+    assert pairs == [{"a", "c"}]
+    leaks = [(where["node"], where["boundary"]) for where in places("leak_to_boundary")]
+    assert ("c", "room") not in leaks and ("b", "sink") not in leaks and ("a", "room") in leaks
+    tables = [(where["node"], where["channel"]) for where in places("channel_heat_load")]
+    assert ("a", "pitch") not in tables and ("b", "mode") not in tables and ("c", "mode") in tables
+
+
+def test_an_unknown_gain_is_calibrated_not_discovered() -> None:
+    assert [where["channel"] for where in places("input_gain")] == ["Q_a", "Q_sun"]
+
+
+def test_a_power_law_needs_several_levels() -> None:
+    network = every_term_network()
+    along = points(network, 20)
+    for series, n_starts in (
+        (np.full(20, 30.0), 0),
+        (np.where(np.arange(20) % 2, 30.0, 0.0), 0),
+        (along.inputs["Q_a"], 1),
+    ):
+        inputs = {**along.inputs, "Q_a": series}
+        survey = survey_of(
+            network, Along(along.time_s, along.temperatures_K, along.boundaries_K, inputs, along.sun_factor)
+        )
+        assert len(list(REGISTRY["input_power_law"].starts({"channel": "Q_a"}, survey))) == n_starts
+
+
+def test_a_table_rests_on_the_levels_of_its_channel() -> None:
+    network = every_term_network()
+    survey = survey_of(network, points(network, 30))
+    by_level = next(iter(REGISTRY["channel_heat_load"].starts({"node": "c", "channel": "mode"}, survey)))
+    assert by_level.settings == {"knots": (0.0, 1.0, 2.0), "levels": True}
+    by_knots = next(iter(REGISTRY["channel_heat_load"].starts({"node": "c", "channel": "pitch"}, survey)))
+    knots = by_knots.settings["knots"]
+    assert not by_knots.settings["levels"]
+    assert (knots[0], knots[-1]) == (survey.along.inputs["pitch"].min(), survey.along.inputs["pitch"].max())
+
+
+def test_a_heater_that_starts_fits_its_reach() -> None:
+    """The power limit that a start implies is its gain times how far below the set-point it saturates."""
+    network = every_term_network()
+    survey = survey_of(network, points(network, 60))
+    for start in REGISTRY["proportional_heater"].starts({"node": "a"}, survey):
+        moved = start.with_amplitudes(np.array([2.0]))
+        assert moved is not None
+        assert moved.values["Q_W"] == pytest.approx(2.0 * start.settings["reach_K"])
+        assert math.isfinite(moved.values["T_set_K"])

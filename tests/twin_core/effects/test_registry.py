@@ -1,0 +1,45 @@
+"""Reading effects back: every damage is named."""
+
+from typing import Any
+
+import pytest
+
+from twin_core.effects import REGISTRY, effect_from_json
+from twin_core.errors import TwinError
+
+GOOD = {
+    "effect": "leak_to_boundary",
+    "where": {"node": "a", "boundary": "b"},
+    "settings": {},
+    "values": {"G_W_per_K": 1.0},
+}
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (None, r"effects\[3\]\.effect: unknown effect None"),
+        ("leak", r"effects\[3\]\.effect: unknown effect 'leak'"),
+        ({}, r"effects\[3\]\.effect: unknown effect None"),
+        ({**GOOD, "effect": "leek"}, r"unknown effect 'leek' \(known: radiation_to_sink"),
+        ({**GOOD, "where": {"node": "a"}}, r"where\.boundary is missing"),
+        ({**GOOD, "where": {"node": 3, "boundary": "b"}}, r"where\.node must be a name"),
+        ({**GOOD, "where": {"node": "a", "boundary": "b", "sink": "c"}}, r"where\.sink is not one of node, boundary"),
+        ({**GOOD, "values": {}}, r"effects\[3\]\.values\.G_W_per_K: is missing"),
+        ({**GOOD, "effect": "missing_conductor", "where": {"nodes": "ab"}}, r"where\.nodes must be a pair of nodes"),
+        ({**GOOD, "effect": "missing_conductor", "where": {"nodes": ["a"]}}, r"where\.nodes must be a pair of nodes"),
+    ],
+)
+def test_damage_is_named(data: Any, message: str) -> None:
+    with pytest.raises(TwinError, match=message):
+        effect_from_json(data, 3)
+
+
+def test_an_intact_effect_is_read() -> None:
+    effect = effect_from_json(GOOD)
+    assert isinstance(effect, REGISTRY["leak_to_boundary"])
+    assert effect.label == "leak_to_boundary(a,b)"
+
+
+def test_a_heat_without_a_name_is_tried_last() -> None:
+    assert [name for name, kind in REGISTRY.items() if kind.fallback] == ["learned_heat_flow"]
