@@ -185,9 +185,10 @@ def _linear_model(
     process_cov = process[:, :, None] * np.eye(density.size)
     observation = np.zeros((noise_K.size, density.size))
     observation[np.arange(noise_K.size), network.sensor_node] = 1.0
+    alone = forcing.n_steps == 0  # one sample: nothing moves, yet the filter wants a matrix
     return LinearModel.build(
-        transition=steps.transition,
-        process_cov=process_cov,
+        transition=np.eye(density.size) if alone else steps.transition,
+        process_cov=np.zeros((density.size, density.size)) if alone else process_cov,
         offset=offset,
         observation=observation,
         noise_variance=noise_K**2,
