@@ -41,8 +41,9 @@ VALIDATION_GAIN = 0.97
 FORWARD_LIMIT = 1.02
 """Nor may it make the end of the training record worse when it is fitted to the beginning alone."""
 
-DECISIVE_FORWARD, TOLERATED_BLOCKS = 0.7, 2.0
-"""Where one event tells all, blocks tell little: an effect that lowers the forward error by 30 % may then double theirs."""
+DECISIVE, TOLERATED = 0.7, 1.7
+"""Where one event tells all, either measure may see little of it: an effect that lowers the one by 30 % may raise the
+other by as much as an event that it has not seen costs."""
 
 LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
@@ -248,9 +249,10 @@ def _accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
 
 def is_valid(validation: Validation) -> bool:
     """Return whether an effect helps where it was not fitted, by an amount that a lumped network can judge."""
-    blocks = validation.ratio < VALIDATION_GAIN and validation.forward_ratio < FORWARD_LIMIT
-    forward = validation.forward_ratio < DECISIVE_FORWARD and validation.ratio < TOLERATED_BLOCKS
-    return (blocks or forward) and validation.removed_share > LUMPING_SHARE
+    blocks, forward = validation.ratio, validation.forward_ratio
+    both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
+    either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
+    return (both or either) and validation.removed_share > LUMPING_SHARE
 
 
 def _worth(judged: Judged) -> float:

@@ -56,7 +56,7 @@
       const { options, columns, read } = build(width);
       const follow = (plot) => (readout.textContent = plot.cursor.idx === null || plot.cursor.idx === undefined ? "" : read(plot.cursor.idx));
       options.hooks = { ...(options.hooks || {}), setCursor: [follow] };
-      chart.plot = new uPlot({ width, height: 210, legend: { show: false }, padding: [10, 8, 0, 0], ...options }, columns, box);
+      chart.plot = new uPlot({ width, height: 210, legend: { show: false }, padding: [10, 20, 0, 0], ...options }, columns, box);
     };
     charts.push(chart);
   }

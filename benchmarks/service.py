@@ -1,0 +1,166 @@
+"""Ingest of the service beside its two natural limits, in one run on one machine.
+
+``bare``: an endpoint of the same server that only parses the same body. ``sqlite``: raw inserts of the same rows, one
+transaction per request, with the same durability (WAL, synchronous=FULL). Run with ``python -m benchmarks.service``.
+"""
+
+import argparse
+import http.client
+import json
+import os
+import sqlite3
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+
+CHANNELS = 12
+BARE = """
+import sys, uvicorn, orjson
+from fastapi import FastAPI, Request
+app = FastAPI()
+
+@app.post("/parse")
+async def parse(request: Request) -> dict[str, int]:
+    return {"accepted": len(orjson.loads(await request.body())["time"])}
+
+server = uvicorn.Server(uvicorn.Config(app, port=0, log_config=None, access_log=False))
+class Announcing(uvicorn.Server):
+    async def startup(self, sockets=None):
+        await super().startup(sockets)
+        print("listening on http://127.0.0.1:%d" % self.servers[0].sockets[0].getsockname()[1], flush=True)
+Announcing(uvicorn.Config(app, port=0, log_config=None, access_log=False)).run()
+"""
+
+
+@contextmanager
+def running(arguments: list[str], folder: Path) -> Iterator[str]:
+    """Yield the URL of a server process."""
+    environment = {**os.environ, "TWIN_PORT": "0", "TWIN_DATABASE_URL": f"sqlite:///{folder / 'bench.sqlite3'}"}
+    process = subprocess.Popen([sys.executable, *arguments], env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process.stdout.readline().removeprefix("listening on ").strip()
+    finally:
+        process.terminate()
+        process.wait()
+        process.stdout.close()
+
+
+def specification() -> dict[str, object]:
+    """Return a twin of a dozen sensors."""
+    names = [f"T_{k}" for k in range(CHANNELS)]
+    return {
+        "twin": "bench",
+        "channels": {name: {"kind": "temperature", "unit": "K"} for name in names},
+        "nodes": [{"id": f"n{k}", "sensor": name} for k, name in enumerate(names)],
+    }
+
+
+def bodies(count: int, frames: int, lane: int) -> list[bytes]:
+    """Return request bodies with samples that nobody sent before."""
+    generator = np.random.default_rng(lane)
+    made = []
+    for number in range(count):
+        start = lane * 10_000_000 + number * frames
+        time_s = [start + k for k in range(frames)]
+        values = {f"T_{c}": np.round(290 + generator.normal(size=frames), 3).tolist() for c in range(CHANNELS)}
+        made.append(json.dumps({"time": time_s, "values": values}).encode())
+    return made
+
+
+def post_all(url: str, path: str, payloads: list[bytes], latencies_s: list[float]) -> None:
+    """Send bodies over one connection that stays open."""
+    parts = urlsplit(url)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port)
+    for body in payloads:
+        begun = time.perf_counter()
+        connection.request("POST", path, body, {"Content-Type": "application/json"})
+        response = connection.getresponse()
+        answer = response.read()
+        if response.status >= 300:
+            raise RuntimeError(answer.decode())
+        latencies_s.append(time.perf_counter() - begun)
+    connection.close()
+
+
+def rate(url: str, path: str, frames: int, requests: int, clients: int, lane: int) -> tuple[float, float]:
+    """Return frames per second and the 99th percentile of the latency."""
+    lanes = [bodies(requests, frames, lane * 100 + client) for client in range(clients)]
+    latencies_s: list[float] = []
+    threads = [threading.Thread(target=post_all, args=(url, path, lanes[c], latencies_s)) for c in range(clients)]
+    begun = time.perf_counter()
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    elapsed_s = time.perf_counter() - begun
+    return frames * requests * clients / elapsed_s, statistics.quantiles(latencies_s, n=100)[98]
+
+
+def raw_sqlite(folder: Path, frames: int, requests: int) -> float:
+    """Return frames per second of plain row inserts, a transaction per request."""
+    connection = sqlite3.connect(folder / "raw.sqlite3", isolation_level=None)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = FULL")
+    columns = ", ".join(f"c{k} REAL" for k in range(CHANNELS))
+    connection.execute(
+        f"CREATE TABLE IF NOT EXISTS frame (twin INTEGER, time INTEGER, {columns}, PRIMARY KEY (twin, time))"
+    )
+    connection.execute("DELETE FROM frame")
+    statement = f"INSERT INTO frame VALUES (1, ?{', ?' * CHANNELS})"
+    values = np.random.default_rng(0).normal(size=(frames, CHANNELS)).tolist()
+    begun = time.perf_counter()
+    for number in range(requests):
+        rows = [(number * frames + k, *values[k]) for k in range(frames)]
+        connection.execute("BEGIN")
+        connection.executemany(statement, rows)
+        connection.execute("COMMIT")
+    elapsed_s = time.perf_counter() - begun
+    connection.close()
+    return frames * requests / elapsed_s
+
+
+CASES = (("1000 frames", 1000, 60, 1), ("50 frames", 50, 400, 1), ("1 frame, 8 clients", 1, 250, 8))
+
+
+def main() -> None:
+    """Print one line per case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=3, help="Rounds, of which the best counts for each contestant.")
+    rounds = parser.parse_args().rounds
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        with running(["-m", "service"], folder) as service, running(["-c", BARE], folder) as bare:
+            post_all(service, "/v1/twins", [json.dumps(specification()).encode()], [])
+            print(f"{'case':20} {'service/s':>10} {'bare/s':>10} {'sqlite/s':>10} {'share':>7} {'p99 ms':>7}")
+            for case, (label, frames, requests, clients) in enumerate(CASES):
+                best: dict[str, float] = {}
+                p99_s = 0.0
+                for turn in range(rounds):
+                    lane = 1 + case * rounds + turn
+                    contestants: dict[str, Callable[[], float]] = {
+                        "bare": lambda lane=lane: rate(bare, "/parse", frames, requests, clients, lane)[0],
+                        "sqlite": lambda: raw_sqlite(folder, frames, requests),
+                    }
+                    reached, p99_s = rate(service, "/v1/twins/bench/telemetry", frames, requests, clients, lane)
+                    best["service"] = max(best.get("service", 0.0), reached)
+                    for key, measure in contestants.items():
+                        best[key] = max(best.get(key, 0.0), measure())
+                share = best["service"] / min(best["bare"], best["sqlite"])
+                print(
+                    f"{label:20} {best['service']:10.0f} {best['bare']:10.0f} {best['sqlite']:10.0f} {share:7.0%} {1e3 * p99_s:7.1f}"
+                )
+
+
+if __name__ == "__main__":
+    main()
