@@ -80,7 +80,7 @@ def forecast(
     ModelError
         If horizon, step or a quantile is out of range, or the balance has no solution.
     """
-    step = float(np.median(np.diff(record.time_s))) if step_s is None else step_s
+    step = _sampling_s(record) if step_s is None else step_s
     _check(horizon_s, step, quantiles)
     network = model.network()
     values = network.parameters.values
@@ -94,10 +94,18 @@ def forecast(
     for term in network.readings:
         part = term.evaluate(future.time_s, values[network.term_index(term)])
         read[:, part.sensor] += part.offset_K
-    std = np.sqrt(_variance(model, network, forcing, path, covariance_K2, future.time_s))[1:]
-    mean = read[1:]
+    wanted = np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:])
+    std = np.sqrt(_variance(model, network, forcing, path, covariance_K2, future.time_s))[wanted]
+    mean = read[wanted]
     bands = {q: mean + norm.ppf(q) * std for q in quantiles}
-    return Forecast(future.time_s[1:], model.spec.sensors, mean, bands)
+    return Forecast(future.time_s[wanted], model.spec.sensors, mean, bands)
+
+
+def _sampling_s(record: Record) -> float:
+    """Return the record's median sampling interval; ModelError if it has a single sample."""
+    if record.time_s.size < 2:
+        raise ModelError("step_s: give one; the telemetry has a single sample and no sampling interval")
+    return float(np.median(np.diff(record.time_s)))
 
 
 def _present(model: CalibratedModel, record: Record, state: Json | None) -> tuple[FloatArray, FloatArray]:
@@ -126,9 +134,9 @@ def future_record(spec: TwinSpec, record: Record, horizon_s: float, step_s: floa
 
     The first sample is the present. Planned samples that lie between the forecast's own times become times too.
     """
-    now = float(record.time_s[-1])
-    count = int(np.floor(horizon_s / step_s + 1e-9))
-    times: FloatArray = now + step_s * np.arange(count + 1, dtype=np.float64)
+    times = own_times_s(record, horizon_s, step_s)
+    if plan is not None:
+        times = np.union1d(times, plan.time_s[(plan.time_s > times[0]) & (plan.time_s < times[-1])])
     values: dict[str, FloatArray] = {}
     needed = [c for c in spec.used_channels if c not in spec.sensors or _is_boundary(spec, c)]
     for name in needed:
@@ -139,6 +147,12 @@ def future_record(spec: TwinSpec, record: Record, horizon_s: float, step_s: floa
         if plan is not None and name in plan.values:
             values[name] = _planned(plan, name, times, last, spec.channels[name].is_held)
     return Record(times, values, record.epoch_ns, "forecast")
+
+
+def own_times_s(record: Record, horizon_s: float, step_s: float) -> FloatArray:
+    """Return the times of a forecast on the record's axis, the present first, (n_times + 1,)."""
+    count = int(np.floor(horizon_s / step_s + 1e-9))
+    return record.time_s[-1] + step_s * np.arange(count + 1, dtype=np.float64)
 
 
 def _is_boundary(spec: TwinSpec, channel: str) -> bool:
