@@ -2,7 +2,10 @@
 
 import json
 import re
+import shutil
+import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,6 +13,7 @@ import pytest
 
 from twin_core.discover.html import render
 
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>'\""
 
 
@@ -173,3 +177,18 @@ def test_numbers_that_are_none(empty: float | None) -> None:
     plots["sensors"]["T_px"] = {"measured": [empty] * 40, "before": [empty] * 40, "after": [empty] * 40}
     page = Page(render(report, plots))
     assert "nan" not in page.text and "None" not in page.text
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_charts_are_drawn_in_a_browser(tmp_path: Path) -> None:
+    plots = example_plots()
+    plots["missing_heat"].append(plots["missing_heat"][0] | {"node": "mx", "mean_W": [None] * 40})
+    (tmp_path / "page.html").write_text(render(example_report(), plots))
+    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-sync"]
+    flags += ["--disable-component-update", "--no-first-run", "--virtual-time-budget=2000", "--enable-logging=stderr"]
+    flags += [f"--user-data-dir={tmp_path / 'profile'}", "--dump-dom", f"file://{tmp_path}/page.html"]
+    run = subprocess.run([str(CHROMIUM), *flags], capture_output=True, text=True, timeout=120)
+    assert "CONSOLE" not in run.stderr
+    # One chart of the sensor, two of the first node; the second node has no heat to lay over its temperature.
+    assert run.stdout.count("<canvas") == 4
