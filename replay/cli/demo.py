@@ -11,8 +11,6 @@ import click
 
 from replay.cli.command import FILE, Command
 
-EFFECT = "random"
-
 
 @click.command(
     cls=Command,
@@ -21,7 +19,7 @@ EFFECT = "random"
 )
 @click.option("--out", default="demo-out", show_default=True, type=FILE, help="Folder for report and recording.")
 @click.option("--serve", is_flag=True, help="Leave the service and its dashboard running until interrupted.")
-@click.option("--effect", default=EFFECT, show_default=True, help="What to hide: an effect's name, random or none.")
+@click.option("--effect", default="random", show_default=True, help="What to hide: an effect's name, random or none.")
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(min=0), help="Draws everything random.")
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome as JSON.")
 def demo(out: Path, serve: bool, effect: str, seed: int, as_json: bool) -> int:
