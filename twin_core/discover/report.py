@@ -98,6 +98,17 @@ def noise_floor_K(model: CalibratedModel) -> float:
     return float(np.sqrt(np.mean(model.noise_vector_K() ** 2)))
 
 
+def best_rejected(search: Search) -> list[Judged]:
+    """Return what was tried and not supported, best first, every set of effects once and none that was found after all."""
+    found = {effect.place for finding in search.findings for effect in finding.effects}
+    once: dict[frozenset[object], Judged] = {}
+    for judged in sorted(search.rejected, key=lambda j: -j.evidence.log_bayes_factor):
+        places = frozenset(effect.place for effect in judged.effects)
+        if not places & found:
+            once.setdefault(places, judged)
+    return list(once.values())
+
+
 def build_report(
     search: Search,
     before: CalibratedModel,
@@ -147,7 +158,7 @@ def build_report(
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
         "not_supported": [
             {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged)}
-            for judged in sorted(search.rejected, key=lambda j: -j.evidence.log_bayes_factor)[:8]
+            for judged in best_rejected(search)[:8]
         ],
         "words": after.summary["words"],
         "notices": before.summary["notices"],

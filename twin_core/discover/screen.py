@@ -146,7 +146,7 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
 def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
     """Return columns of all segments, whitened and flattened to (n_rows, n_columns)."""
     parts = [
-        whiten(fit.problem, fit.latent, nominal, block)[0].reshape(-1, block.shape[2])
+        whiten(fit.problem, fit.latent, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
         for nominal, block in zip(fit.nominals, blocks, strict=True)
     ]
     return np.concatenate(parts)
