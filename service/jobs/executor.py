@@ -11,6 +11,7 @@ import multiprocessing.connection
 import os
 import signal
 import time
+import traceback
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
@@ -27,7 +28,12 @@ POLL_S = 0.2
 
 
 class JobFailed(Exception):
-    """A task ended without a result; the message says why in one line."""
+    """A task ended without a result; the message says why in one line, ``trace`` where it is a defect of ours."""
+
+    def __init__(self, message: str, trace: str | None = None) -> None:
+        """Keep both."""
+        super().__init__(message)
+        self.trace = trace
 
 
 class JobCancelled(Exception):
@@ -99,7 +105,7 @@ class ProcessPerTask(Executor):
                 if kind == "progress":
                     progress(*rest)
                 elif kind == "failed":
-                    raise JobFailed(rest[0])
+                    raise JobFailed(*rest)
                 else:
                     return rest[0]
         finally:
@@ -158,6 +164,7 @@ def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[
     def progress(fraction: float, message: str) -> None:
         connection.send(("progress", float(fraction), str(message)))
 
+    answer: tuple[Any, ...]
     try:
         answer = ("done", function(*args, progress=progress, **kwargs))
     except TwinError as error:
@@ -165,6 +172,6 @@ def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[
     except MemoryError:
         answer = ("failed", "ran out of memory; use a shorter part of the archive")
     except Exception as error:
-        answer = ("failed", f"{type(error).__name__}: {error}")
+        answer = ("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
     with contextlib.suppress(BrokenPipeError):  # the parent is gone; nobody wants the answer
         connection.send(answer)

@@ -114,6 +114,8 @@ class Jobs:
             state, message = "cancelled", "cancelled"
         except (JobFailed, Problem) as error:
             message = error.detail if isinstance(error, Problem) else str(error)
+            if isinstance(error, JobFailed) and error.trace is not None:
+                log.error("a job met a defect", extra={"job": row.id, "kind": row.kind, "trace": error.trace})
         except Exception as error:
             message = f"{type(error).__name__}: {error}"
             log.exception("a job failed unexpectedly", extra={"job": row.id, "kind": row.kind})

@@ -18,6 +18,8 @@ SMALL = 512
 """Chunks with fewer rows than this are compacted."""
 MOST_SMALL_CHUNKS = 64
 MOST_SMALL_ROWS = 16_384
+MOST_CUTS = 16
+"""Compaction cuts where a step exceeds this fraction of the whole span, so at most this often."""
 
 
 @dataclass(frozen=True)
@@ -120,17 +122,23 @@ def _insert(
 
 
 def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> None:
-    """Rewrite the small chunks as one, in the order of arrival."""
+    """Rewrite the small chunks in the order of time, cut where time makes a jump, so that none spans idle years."""
     rows = connection.execute(
         "SELECT id, seq, time, value FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
     ).fetchall()
-    seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])
     time_us = np.concatenate([np.frombuffer(row[2], dtype="<i8") for row in rows])
-    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)
+    order = np.argsort(time_us, kind="stable")
+    time_us = time_us[order]
+    seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])[order]
+    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)[:, order]
     connection.executemany("DELETE FROM chunk WHERE id = ?", [(row[0],) for row in rows])
-    _insert(connection, twin, seq, time_us, values)
-    n = int(time_us.size)
-    remaining = (1, n) if n < SMALL else (0, 0)
+    steps = np.diff(time_us)
+    cuts = np.flatnonzero(steps > max(int(time_us[-1] - time_us[0]) // MOST_CUTS, 1)) + 1
+    remaining = [0, 0]
+    for part in np.split(np.arange(time_us.size), cuts):
+        _insert(connection, twin, seq[part], time_us[part], values[:, part])
+        if part.size < SMALL:
+            remaining = [remaining[0] + 1, remaining[1] + part.size]
     connection.execute("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", (*remaining, twin))
 
 

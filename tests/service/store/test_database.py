@@ -1,0 +1,98 @@
+"""One writer for all: shared commits, isolated failures, readers beside it, migrations."""
+
+import asyncio
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from service.store import migrations
+from service.store.database import Database
+from service.store.lock import StoreError
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Iterator[Database]:
+    opened = Database(tmp_path / "t.sqlite3")
+    opened.submit(lambda c: c.execute("CREATE TABLE t (x INTEGER PRIMARY KEY)") and None).result()
+    yield opened
+    opened.close()
+
+
+def put(connection: sqlite3.Connection, *numbers: int) -> int:
+    for number in numbers:
+        connection.execute("INSERT INTO t VALUES (?)", (number,))
+    return len(numbers)
+
+
+def numbers(connection: sqlite3.Connection) -> list[int]:
+    return [x for (x,) in connection.execute("SELECT x FROM t ORDER BY x")]
+
+
+def test_a_failing_operation_undoes_itself_alone(database: Database) -> None:
+    gate = database.submit(lambda c: __import__("time").sleep(0.05))  # let the others queue up behind one commit
+    answers = [database.submit(put, 1), database.submit(put, 2, 1), database.submit(put, 3)]
+    gate.result()
+    assert answers[0].result() == 1 and answers[2].result() == 1
+    with pytest.raises(sqlite3.IntegrityError):
+        answers[1].result()
+    assert asyncio.run(database.read(numbers)) == [1, 3]
+
+
+def test_any_exception_undoes_the_operation(database: Database) -> None:
+    def half(connection: sqlite3.Connection) -> None:
+        put(connection, 7)
+        raise LookupError("gone")
+
+    with pytest.raises(LookupError):
+        database.submit(half).result()
+    assert asyncio.run(database.read(numbers)) == []
+
+
+def test_readers_cannot_write_and_see_what_is_committed(database: Database) -> None:
+    async def use() -> list[int]:
+        await database.write(put, 5)
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            await database.read(put, 6)
+        return await database.read(numbers)
+
+    assert asyncio.run(use()) == [5]
+
+
+def test_one_process_at_a_time(database: Database, tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="another server uses this database"):
+        Database(tmp_path / "t.sqlite3")
+
+
+def test_durability_settings(database: Database) -> None:
+    assert database.submit(lambda c: c.execute("PRAGMA synchronous").fetchone()[0]).result() == 2
+    assert database.submit(lambda c: c.execute("PRAGMA journal_mode").fetchone()[0]).result() == "wal"
+
+
+def test_migrations_run_once_and_newer_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "t.sqlite3"
+    Database(path).close()
+    with sqlite3.connect(path, isolation_level=None) as connection:
+        assert migrations.migrate(connection) == []
+        connection.execute("INSERT INTO migration (name) VALUES ('from the future')")
+    connection.close()
+    with pytest.raises(StoreError, match="newer version"):
+        Database(path)
+
+
+def test_a_failed_step_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(connection: sqlite3.Connection) -> None:
+        connection.execute("CREATE TABLE half (x)")
+        connection.execute("CREATE TABLE nonsense (")
+
+    path = tmp_path / "t.sqlite3"
+    Database(path).close()
+    monkeypatch.setattr(migrations, "STEPS", (*migrations.STEPS, ("broken", broken)))
+    with pytest.raises(StoreError):
+        Database(path)
+    monkeypatch.undo()
+    Database(path).close()
+    with sqlite3.connect(path) as connection:
+        assert connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'half'").fetchone() == (0,)
+    connection.close()

@@ -1,0 +1,82 @@
+"""The archive against a dictionary, through many batches in any order, compaction included."""
+
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.frames import Batch
+from service.store import events, samples, twins
+from service.store.database import Database
+
+SPEC = {"twin": "t", "channels": {"a": {}, "b": {}}}
+
+
+@pytest.fixture
+def connection(tmp_path: Path) -> Iterator[sqlite3.Connection]:
+    database = Database(tmp_path / "t.sqlite3")
+    database.submit(lambda c: twins.register(c, "t", SPEC)).result()
+    with sqlite3.connect(tmp_path / "t.sqlite3", isolation_level=None) as own:
+        yield own
+    own.close()
+    database.close()
+
+
+def test_many_batches_in_any_order(connection: sqlite3.Connection) -> None:
+    generator = np.random.default_rng(0)
+    order = generator.permutation(4000)
+    position, numbers = 0, []
+    while position < order.size:
+        part = order[position : position + int(generator.integers(1, 80))]
+        position += part.size
+        batch = Batch(part.astype(np.int64) * 1000, np.stack([part * 1.0, -part * 1.0]))
+        receipt = samples.append(connection, 1, batch)
+        assert receipt.stored.all()
+        numbers += range(receipt.first_seq, receipt.first_seq + part.size)
+    assert numbers == list(range(1, 4001))
+    found = samples.select(connection, 1, 2, [1])
+    np.testing.assert_array_equal(found.time_us, np.arange(4000) * 1000)
+    np.testing.assert_array_equal(found.values, -np.arange(4000.0)[None, :])
+    part = samples.select(connection, 1, 2, [0, 1], 5000, 9000)
+    assert part.values[0].tolist() == [5, 6, 7, 8]
+    chunks = connection.execute("SELECT count(*) FROM chunk").fetchone()[0]
+    assert chunks < samples.MOST_SMALL_CHUNKS + 40  # a chunk per batch would be about a hundred
+    seqs, replayed = samples.since_seq(connection, 1, 2, 3990)
+    assert seqs.tolist() == list(range(3991, 4001))
+    assert replayed.time_us.tolist() == (order[-10:] * 1000).tolist()
+    again = samples.append(connection, 1, Batch(found.time_us, np.stack([found.values[0] * -1, found.values[0]])))
+    assert again.duplicates == 4000
+
+
+def test_compaction_does_not_span_idle_time(connection: sqlite3.Connection) -> None:
+    year_us = 365 * 86_400 * 10**6
+    for number in range(samples.MOST_SMALL_CHUNKS):
+        instant = (number % 2) * year_us + number * 10**6
+        samples.append(connection, 1, Batch(np.array([instant]), np.zeros((2, 1))))
+    spans = connection.execute("SELECT last_us - first_us FROM chunk").fetchall()
+    assert len(spans) == 2 and max(spans)[0] < year_us // 1000
+
+
+def test_numbers_are_shared_with_events(connection: sqlite3.Connection) -> None:
+    one = Batch(np.array([5]), np.zeros((2, 1)))
+    assert samples.append(connection, 1, one).first_seq == 1
+    assert [e.seq for e in events.append(connection, 1, 0, [("job", {}), ("model", {})])] == [2, 3]
+    assert samples.append(connection, 1, Batch(np.array([6]), np.zeros((2, 1)))).first_seq == 4
+
+
+def test_blocks_cover_everything_once(connection: sqlite3.Connection) -> None:
+    for start in range(0, 20_000, 1000):
+        time_us = np.arange(start, start + 1000, dtype=np.int64)
+        samples.append(connection, 1, Batch(time_us, np.zeros((2, 1000))))
+    seen, position = 1, 0
+    while True:
+        stop = samples.block_stop(connection, 1, position, 5000)
+        found = samples.select(connection, 1, 2, [0], position, stop)
+        if found.time_us.size == 1:
+            break
+        assert found.time_us[0] == position
+        seen += found.time_us.size - 1
+        position = int(found.time_us[-1])
+    assert seen == 20_000
