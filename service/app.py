@@ -11,6 +11,7 @@ from service.access import Gate
 from service.bodies import Bodies
 from service.deps import Service
 from service.jobs.runner import Jobs
+from service.jobs.schedule import Schedule
 from service.live.live import Live
 from service.metrics import Metrics, Observe
 from service.registry import Registry
@@ -53,10 +54,12 @@ async def _running(
     service = Service(settings, database, Registry(()), metrics, hub, live_state, runner)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
+    schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
     try:
         yield service
     finally:
         hub.close()
+        await schedule.close()
         await runner.close()
         await live_state.close()
 

@@ -35,6 +35,7 @@ class Settings(BaseSettings):
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
     assimilate: bool = Field(True, description="Whether new samples update the state of the active model.")
     calibrate_every_s: float | None = Field(None, gt=0, description="Recalibrate on this schedule; unset: on request.")
+    anomaly_patience_s: float = Field(3600.0, ge=0, description="Recalibrate if an anomaly lasts so long; 0: never.")
     log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
 
     @field_validator("database_url")

@@ -40,6 +40,7 @@ Json = dict[str, Any]
 class _Running:
     """A job that has not ended."""
 
+    twin: int
     cancel: Cancel
     task: "asyncio.Task[None] | None" = None
 
@@ -68,7 +69,7 @@ class Jobs:
         """Queue a job and return it."""
         job = uuid.uuid4().hex[:12]
         row = await self._database.write(jobs.create, twin.key, job, kind, request)
-        running = _Running(Cancel())
+        running = _Running(twin.key, Cancel())
         self._running[job] = running
         running.task = asyncio.create_task(self._run(twin, row, request, running.cancel))
         return row
@@ -89,6 +90,10 @@ class Jobs:
             for row in await self._database.read(jobs.select, twin.key, kind):
                 if row.state in ("queued", "running"):
                     await self.cancel(twin, kind, row.id)
+
+    def busy(self, twin: Entry) -> bool:
+        """Return whether a job of this twin is queued or running."""
+        return any(running.twin == twin.key for running in self._running.values())
 
     async def close(self) -> None:
         """End every job; each is marked as it ends."""

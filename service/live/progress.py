@@ -67,6 +67,14 @@ def rewind(connection: sqlite3.Connection, twin: Entry, version: int, late_us: i
     return checkpoint
 
 
+def switch(connection: sqlite3.Connection, twin: Entry, version: int) -> Checkpoint | None:
+    """Let another version take over: end what was said by the others, return where it stands itself."""
+    row = connection.execute("SELECT last_us FROM head WHERE twin = ?", (twin.key,)).fetchone()
+    if row is not None and row[0] is not None:
+        anomalies.close_others(connection, twin.key, version, row[0])
+    return checkpoints.before(connection, twin.key, version)
+
+
 def next_samples(connection: sqlite3.Connection, twin: Entry, position_us: int | None) -> Samples:
     """Return about a block of samples from a position on, that sample included."""
     stop_us = samples.block_stop(connection, twin.key, position_us, BLOCK)

@@ -12,7 +12,7 @@ from service.live import progress
 from service.live.engine import Engine
 from service.live.progress import Step
 from service.registry import Entry
-from service.store import checkpoints, models
+from service.store import models
 from service.store.anomalies import Change
 from service.store.checkpoints import Checkpoint
 from service.store.database import Database
@@ -148,7 +148,7 @@ class Tracker:
             return
         if self.active is not None and self.active.version == active.version:
             return
-        checkpoint = await self._database.read(checkpoints.before, self.twin.key, active.version)
+        checkpoint = await self._database.write(progress.switch, self.twin, active.version)
         self.position = None if checkpoint is None else Position.of(checkpoint)
         self.active = active
 

@@ -106,3 +106,9 @@ def explain(connection: sqlite3.Connection, twin: int, sensors: Sequence[str], c
     for sensor in sensors:
         query = "UPDATE anomaly SET cause = ? WHERE twin = ? AND sensor = ? AND cause IS NULL"
         connection.execute(query, (text, twin, sensor))
+
+
+def open_ids(connection: sqlite3.Connection, twin: int, version: int | None) -> list[int]:
+    """Return the numbers of the anomalies of one model version that last."""
+    query = "SELECT id FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
+    return [number for (number,) in connection.execute(query, (twin, version))]
