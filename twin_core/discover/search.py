@@ -231,20 +231,29 @@ def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int
 
 def _accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     """Keep the best option that passes evidence and validation; False if none does."""
-    judged = sorted(options, key=_worth)
+    judged = once_each(options)
+    failed: list[Judged] = []
     for best in judged[:N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             break
-        validation = validate(state.trial, best.trial)
-        own = Judged(best.effects, best.evidence, best.trial, validation)
-        if is_valid(validation):
-            close = [j for j in judged if j is not best and _is_close(j, best)]
+        own = replace(best, validation=validate(state.trial, best.trial))
+        if own.validation is not None and is_valid(own.validation):
+            close = [j for j in judged if j is not best and j not in failed and _is_close(j, best)]
             state.trial = best.trial
             state.findings.append(Finding(own, tuple(close)))
             return True
+        failed.append(best)
         state.rejected.append(own)
     state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
     return False
+
+
+def once_each(options: Sequence[Judged]) -> list[Judged]:
+    """Return the options, best first, every set of effects and places once."""
+    best: dict[frozenset[object], Judged] = {}
+    for judged in sorted(options, key=_worth):
+        best.setdefault(frozenset(effect.place for effect in judged.effects), judged)
+    return list(best.values())
 
 
 def is_valid(validation: Validation) -> bool:
