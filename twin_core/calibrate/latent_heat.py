@@ -189,16 +189,20 @@ def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nomi
 
 
 def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:
-    """Return the linear response of the readings to the free parameters, (n_samples, n_sensors, n_free)."""
+    """Return the linear response of the readings to the free parameters, (n_samples, n_sensors, n_free).
+
+    The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`).
+    """
     network, forcing = problem.network, nominal.segment.forcing
     stages = nominal.steps.stages_K
-    balance = balance_along(
-        network, values, forcing, stages, 0, forcing.n_steps, derivatives=True, extra_W=nominal.extra_W
-    )
-    n = problem.n_nodes
+    balance = balance_along(network, values, forcing, stages, 0, forcing.n_steps, derivatives=True)
+    n, jacobian = problem.n_nodes, balance.jacobian_per_s
+    if network.capacities:
+        heated = balance_along(network, values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
+        jacobian = heated.jacobian_per_s
     block, _ = march_sensitivities(
         forcing.step_s,
-        balance.jacobian_per_s.reshape(-1, 2, n, n),
+        jacobian.reshape(-1, 2, n, n),
         balance.entry_free,
         balance.entry_node,
         balance.entry_series.reshape(balance.entry_free.size, forcing.n_steps, 2),
@@ -442,32 +446,43 @@ def _pass(fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = Fa
     problem, nominals = fit.problem, fit.nominals
     if smoothing:
         nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
-    free, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
-    latent, value = sizes.improve(problem, fit.latent, nominals)
+    free, latent, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
+    latent, value = sizes.improve(problem, latent, nominals)
     return HeatFit(problem, free, latent, nominals, value)
+
+
+def with_capacities(problem: Problem, latent: LatentHeat, before: FloatArray, after: FloatArray) -> LatentHeat:
+    """Return the latent heat that makes the same rates of temperature at other parameter values.
+
+    Telemetry tells how fast temperatures move, not by how many watts. A size held in watts would make the likelihood of
+    a capacity depend on the size more than on the heat balance, which a Gauss-Newton step does not see.
+    """
+    index = problem.network.capacity_index
+    return replace(latent, std_W=latent.std_W * after[index] / before[index])
 
 
 def _improve(
     problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float
-) -> tuple[FloatArray, tuple[Nominal, ...]]:
+) -> tuple[FloatArray, LatentHeat, tuple[Nominal, ...]]:
     """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
     parameters, std = problem.network.parameters, leashed(problem, leash)
+    now = parameters.to_values(free)
 
-    def posterior(at: FloatArray, about: Sequence[Nominal]) -> float:
-        return log_likelihood(problem, latent, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
+    def posterior(at: FloatArray, size: LatentHeat, about: Sequence[Nominal]) -> float:
+        return log_likelihood(problem, size, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
-    before = posterior(free, nominals)
+    before = posterior(free, latent, nominals)
     step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
     logarithmic = problem.logarithmic
     step *= min(1.0, 1.5 / max(np.abs(step[logarithmic]).max(initial=0.0), 1e-12))
     for _ in range(5):
         trial = free + step
         values = parameters.to_values(trial)
-        about = _relinearised(problem, values, nominals)
-        if posterior(trial, about) > before:
-            return trial, about
+        size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
+        if posterior(trial, size, about) > before:
+            return trial, size, about
         step = 0.35 * step
-    return free, tuple(nominals)
+    return free, latent, tuple(nominals)
 
 
 def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], LatentHeat]:

@@ -36,7 +36,7 @@ def whiten_columns(
     force_variance : (n,)
         Stationary variance of the heat on each node, W^2.
     state_variance : (n,)
-        Variance per second added to each state, K^2/s: a floor that keeps the filter awake.
+        Variance that each step adds to each state, K^2: a floor that keeps the filter awake.
     observed : (n_sensors,)
         State that each sensor reads.
     noise_variance : (n_sensors,)

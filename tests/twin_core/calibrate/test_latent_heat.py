@@ -1,0 +1,206 @@
+"""Fitting in the presence of undeclared heat: the likelihood densely, its slopes numerically, and what it recovers."""
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from tests.analytic import laplacian, linear_states
+from tests.helpers import at_named, central_difference, conductive_spec, record_of
+from twin_core.calibrate.latent_heat import (
+    LatentHeat,
+    Nominal,
+    fit_with_latent_heat,
+    gauss_newton_step,
+    linearise,
+    log_likelihood,
+    parameter_columns,
+)
+from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.network.model import build_network
+from twin_core.network.spec import load_spec
+from twin_core.simulate.kernels import GAMMA
+from twin_core.simulate.rollout import rollout
+from twin_core.telemetry import Record
+
+CAPACITY = np.array([4.0e3, 9.0e3])
+CONDUCTANCE = 3.0
+NOISE_K = np.array([0.1, 0.2])
+LATENT = LatentHeat(np.array([5.0, 12.0]), 400.0)
+STEP_S = 60.0
+RATES = -laplacian(2, [(0, 1)], [CONDUCTANCE]) / CAPACITY[:, None]
+
+
+def spec_data() -> dict:
+    power = {"kind": "power", "unit": "W"}
+    return conductive_spec(2, [(0, 1)], channels={"Q": power}, loads=[{"channel": "Q", "node": "n0"}])
+
+
+def record(n_times: int, seed: int = 0) -> Record:
+    rng = np.random.default_rng(seed)
+    power = np.repeat(rng.choice([0.0, 40.0, 90.0], n_times // 8 + 1), 8)[:n_times]
+    time_s = STEP_S * np.arange(n_times)
+    truth = linear_states(RATES, np.outer(power, [1.0 / CAPACITY[0], 0.0]), np.array([290.0, 285.0]), time_s)
+    read = truth + rng.normal(size=truth.shape) * NOISE_K
+    read[rng.random(truth.shape) < 0.15] = np.nan
+    return record_of(time_s, Q=power, T0=read[:, 0], T1=read[:, 1])
+
+
+def small_problem(n_times: int = 25) -> Problem:
+    named = {"C:n0": CAPACITY[0], "C:n1": CAPACITY[1], "G:n0|n1": CONDUCTANCE}
+    network = at_named(build_network(load_spec(spec_data())), {k: float(v) for k, v in named.items()})
+    return build_problem(network, [record(n_times)], NOISE_K, 1e9)
+
+
+def about_own_rollout(problem: Problem) -> Nominal:
+    """Return the problem linearised about its own trajectory, without undeclared heat."""
+    (segment,) = problem.segments
+    values = problem.network.parameters.values
+    path = rollout(problem.network, values, segment.start_prior_K, segment.forcing)
+    states = np.vstack([path.start_K, path.stages_K[:, 1]])
+    return linearise(problem, values, segment, states, np.zeros((segment.forcing.n_steps, 2)))
+
+
+def scheme(drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (A, b) of one step of the SDIRK scheme by its stability function."""
+    z = np.zeros((3, 3))
+    z[:2, :2], z[:2, 2] = RATES * STEP_S, drive * STEP_S
+    implicit = np.linalg.inv(np.eye(3) - GAMMA * z)
+    joint = implicit @ implicit @ (np.eye(3) + (1.0 - 2.0 * GAMMA) * z)
+    return joint[:2, :2], joint[:2, 2]
+
+
+def dense_joint(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and covariance of all readings of [T, q] models, written as sums over independent sources."""
+    (segment,) = problem.segments
+    power = segment.record.values["Q"]
+    n_times = power.size
+    transition, _ = scheme(np.zeros(2))
+    response = np.stack([scheme(np.eye(2)[i] / CAPACITY[i])[1] for i in range(2)], axis=1)
+    keep = np.exp(-STEP_S / LATENT.length_s)
+    full = np.block([[transition, response], [np.zeros((2, 2)), keep * np.eye(2)]])
+    floor = (1e-3 * np.median(NOISE_K)) ** 2  # what keeps the filter awake, per step
+    increment = np.concatenate([np.full(2, floor), (1.0 - keep**2) * LATENT.std_W**2])
+    mean, means = segment.start_prior_K, [segment.start_prior_K]
+    states = [np.hstack([np.eye(4), np.zeros((4, 4 * (n_times - 1)))])]
+    scales = [np.concatenate([segment.start_std_K**2, LATENT.std_W**2])]
+    for k in range(1, n_times):
+        mean = transition @ mean + scheme(np.array([power[k - 1] / CAPACITY[0], 0.0]))[1]
+        means.append(mean)
+        state = full @ states[-1]
+        state[:, 4 * k : 4 * k + 4] = np.eye(4)
+        states.append(state)
+        scales.append(increment)
+    design = np.concatenate([s[:2] for s in states])
+    covariance = design @ np.diag(np.concatenate(scales)) @ design.T + np.diag(np.tile(NOISE_K**2, n_times))
+    return np.concatenate(means), covariance
+
+
+def test_the_likelihood_is_the_joint_gaussian() -> None:
+    problem = small_problem()
+    mean, covariance = dense_joint(problem)
+    seen = problem.segments[0].valid.ravel()
+    read = problem.segments[0].measured_K.ravel()
+    expected = multivariate_normal.logpdf(read[seen], mean[seen], covariance[np.ix_(seen, seen)])
+    found = log_likelihood(problem, LATENT, [about_own_rollout(problem)])
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_parameter_columns_are_the_central_difference_of_the_trajectory() -> None:
+    problem = small_problem()
+    (segment,) = problem.segments
+    parameters = problem.network.parameters
+    found = parameter_columns(problem, parameters.values, about_own_rollout(problem))
+    for column in range(parameters.free.size):
+
+        def read(x: float, column: int = column) -> np.ndarray:
+            free = parameters.free.copy()
+            free[column] = x
+            path = rollout(problem.network, parameters.to_values(free), segment.start_prior_K, segment.forcing)
+            return path.at_samples(segment.forcing.sample_step)
+
+        expected = central_difference(read, float(parameters.free[column]), 1e-3)
+        np.testing.assert_allclose(found[:, :, column], expected, atol=1e-6)
+
+
+def test_the_hessian_is_that_of_generalised_least_squares() -> None:
+    """J' S^-1 J plus the prior, with S the dense covariance and J the central difference."""
+    problem = small_problem()
+    nominal = about_own_rollout(problem)
+    parameters = problem.network.parameters
+    _, covariance = dense_joint(problem)
+    seen = problem.segments[0].valid.ravel()
+    columns = parameter_columns(problem, parameters.values, nominal).reshape(seen.size, -1)[seen]
+    inverse = np.linalg.inv(covariance[np.ix_(seen, seen)])
+    expected = columns.T @ inverse @ columns + np.diag(1.0 / parameters.prior_std**2)
+    step, hessian = gauss_newton_step(problem, parameters.free, LATENT, [nominal])
+    np.testing.assert_allclose(hessian, expected, rtol=1e-7)
+    residual = (problem.segments[0].measured_K - nominal.reference_K).ravel()[seen]
+    # The normal equations are damped by 1e-6 of their diagonal.
+    np.testing.assert_allclose(step, np.linalg.solve(expected, columns.T @ inverse @ residual), rtol=1e-3, atol=1e-6)
+
+
+def three_nodes(seed: int, missing_W: float) -> tuple[Problem, dict[str, float]]:
+    """Return a problem whose telemetry holds heat that nobody declared on the middle node, and the truth."""
+    rng = np.random.default_rng(seed)
+    capacity, conductance = np.array([4.0e3, 7.0e3, 2.5e3]), [2.0, 1.2]
+    edges = [(0, 1), (1, 2)]
+    power = {name: {"kind": "power", "unit": "W"} for name in ("Q0", "Q2")}
+    loads = [{"channel": "Q0", "node": "n0"}, {"channel": "Q2", "node": "n2"}]
+    walls = [{"between": [f"n{i}", "room"], "conductance_W_per_K": {"value": 0.8}} for i in range(3)]
+    data = conductive_spec(3, edges, channels=power, loads=loads, boundaries={"room": {"value_K": 285.0}})
+    data["conductors"] += walls
+    time_s = 60.0 * np.arange(500)
+    heat = {c: np.repeat(rng.choice([0.0, 30.0, 60.0], 40), 13)[:500] for c in power}
+    hidden = missing_W * (1.0 + np.sin(2.0 * np.pi * time_s / 5400.0))
+    rates = -(laplacian(3, edges, conductance) + 0.8 * np.eye(3)) / capacity[:, None]
+    drive = (np.stack([heat["Q0"], hidden, heat["Q2"]], axis=1) + 0.8 * 285.0) / capacity
+    states = linear_states(rates, drive, np.full(3, 288.0), time_s) + rng.normal(0.0, 0.05, (500, 3))
+    readings = {f"T{i}": states[:, i] for i in range(3)}
+    spec = load_spec(data)
+    problem = build_problem(build_network(spec), [record_of(time_s, **heat, **readings)], np.full(3, 0.05), 1e9)
+    truth = {f"C:n{i}": float(c) for i, c in enumerate(capacity)}
+    return problem, truth | {"G:n0|n1": conductance[0], "G:n1|n2": conductance[1]}
+
+
+def log_errors(problem: Problem, values: np.ndarray, truth: dict[str, float]) -> np.ndarray:
+    named = dict(zip(problem.network.parameters.index, values, strict=True))
+    return np.array([np.log(named[name] / value) for name, value in truth.items()])
+
+
+@pytest.mark.parametrize("seed", [0, 2, 3])
+def test_parameters_are_recovered_although_heat_is_missing(seed: int) -> None:
+    """Plain trajectories bend the parameters to swallow 20 W; the latent heat takes it instead."""
+    problem, truth = three_nodes(seed, 20.0)
+    fit = fit_with_latent_heat(problem)
+    plain = minimise(problem)
+    with_heat = np.abs(log_errors(problem, fit.values, truth))
+    without = np.abs(log_errors(problem, problem.values(plain.unknowns), truth))
+    told = np.array([name != "C:n1" for name in truth])  # the heat's own node: only its response to others tells
+    assert with_heat[told].max() < 0.02
+    assert with_heat.max() < 0.7
+    assert without[told].max() > 10.0 * with_heat[told].max()
+    assert np.argmax(fit.latent.std_W) == 1  # the heat is on the middle node
+    assert 5.0 < fit.latent.std_W[1] < 60.0
+
+
+def test_no_start_near_the_truth_does_better() -> None:
+    """A size of the heat held in watts would trap the capacities far from their optimum."""
+    problem, truth = three_nodes(2, 20.0)
+    from_guesses = fit_with_latent_heat(problem)
+    from_truth = fit_with_latent_heat(problem, problem.network.parameters.updated(truth).free)
+    assert from_guesses.log_posterior > from_truth.log_posterior - 1.0
+
+
+def test_nothing_is_made_up_where_nothing_is_missing() -> None:
+    problem, truth = three_nodes(1, 0.0)
+    fit = fit_with_latent_heat(problem)
+    assert np.abs(log_errors(problem, fit.values, truth)).max() < 0.05
+    assert fit.latent.std_W.max() < 1.0
+
+
+def test_a_fit_never_ends_below_where_it_started() -> None:
+    problem, _ = three_nodes(2, 20.0)
+    short = fit_with_latent_heat(problem, n_passes=1)
+    long = fit_with_latent_heat(problem, near=short, free=short.free, n_passes=6)
+    assert long.log_posterior >= short.log_posterior - 1e-6
