@@ -266,4 +266,9 @@ def build_problem(
     """
     if not records:
         raise TelemetryError("no telemetry given")
-    return Problem(network, tuple(build_segment(network, r, max_step_s) for r in records), noise_K)
+    segments = tuple(build_segment(network, r, max_step_s) for r in records)
+    for column, sensor in enumerate(network.spec.sensors):
+        if not any(segment.valid[:, column].any() for segment in segments):
+            where = ", ".join(dict.fromkeys(r.name for r in records))
+            raise TelemetryError(f"{where}: channel '{sensor}' has no usable samples; drop the sensor from its node")
+    return Problem(network, segments, noise_K)
