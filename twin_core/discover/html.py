@@ -148,6 +148,10 @@ def _by_temperature(item: Mapping[str, Any]) -> Json:
     # Inside a bin neighbouring samples share one smooth error, so the band does not shrink with their number.
     spread = [float(np.sqrt(np.mean(std_W[part] ** 2))) for part in bins]
     effect = [float(effect_W[part].mean()) for part in bins]
+    if law := item.get("law"):
+        # The regression's own curve, where there is one; the effect's heat moves onto its temperatures.
+        at, mean, spread = (list(_floats(law, key)) for key in ("temperature_K", "mean_W", "std_W"))
+        effect, centre = list(np.interp(at, centre, effect)), at
     return {
         "points": [_nullable(temperature_K[order]), _nullable(heat_W[order])],
         "bins": [_nullable(np.array(column)) for column in (centre, mean, spread, effect)],

@@ -14,6 +14,7 @@ from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fr
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.search import Search, search, threshold
+from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
@@ -83,7 +84,9 @@ def close_loop(
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found, false_alarm_rate))
     progress(0.93, "drawing")
-    plots = build_plots(found, before, after, held, predictions, report)
+    witness = bear_witness(found)
+    report |= told_by(witness, report)
+    plots = build_plots(found, before, after, held, predictions, report, witness)
     report["elapsed_s"] = time.perf_counter() - begun
     progress(1.0, "done")
     return ClosedLoop(report, after, before, plots)

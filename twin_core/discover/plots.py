@@ -6,17 +6,15 @@ from typing import Any
 import numpy as np
 
 from twin_core._typing import FloatArray, Json
-from twin_core.calibrate.latent_heat import smoothed_states
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.search import Search
-from twin_core.effects.base import Effect
-from twin_core.network.dynamics import fill_boundaries
-from twin_core.network.terms import Along
+from twin_core.discover.witness import NodeHeat, Witness
+from twin_core.latent_force.polynomial import ForcePolynomial
 from twin_core.telemetry import Record
 
 MAX_POINTS = 1600
+LAW_POINTS = 60
 
 
 def _thin(n: int) -> np.ndarray:
@@ -40,6 +38,7 @@ def build_plots(
     held: Sequence[HeldOut],
     predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
     report: Json,
+    witness: Witness,
 ) -> Json:
     """Return everything that the page of a report draws.
 
@@ -49,12 +48,14 @@ def build_plots(
         As in ``report.build_report``.
     report
         The finished report, for its criteria and words.
+    witness
+        The heat that the declared model lacks.
     """
-    first = search.base.fit.nominals[0].segment.record
+    first = search.base.fit.nominals[-1].segment.record
     return {
         "dated": first.epoch_ns is not None,
         **_temperatures(search, held, predictions),
-        "missing_heat": [_missing_heat(search, node) for node in _nodes_of_interest(search)],
+        "missing_heat": [_missing_heat(heat, first) for heat in witness.heats],
         "network": _network(after),
         "criteria": {
             "bias_K": before.spec.criteria.bias_K,
@@ -93,75 +94,30 @@ def _temperatures(
     }
 
 
-def _nodes_of_interest(search: Search) -> list[str]:
-    """Return the nodes that the findings touch, else the two with most latent heat for their size."""
-    nodes: list[str] = []
-    for finding in search.findings:
-        for effect in finding.effects:
-            nodes += _touched(effect, search.base)
-    if not nodes:
-        declared = search.base.fit.problem.network.nodes
-        nodes = [declared[i] for i in np.argsort(-search.base.fit.latent.std_W)[:2]]
-    return list(dict.fromkeys(nodes))[:4]
-
-
-def _touched(effect: Effect, base: Trial) -> list[str]:
-    """Return the declared nodes at which an effect acts."""
-    layout = base.fit.problem.network.layout
-    if "node" in effect.where:
-        return [effect.where["node"]]
-    if "nodes" in effect.where:
-        return [n for n in effect.where["nodes"] if n in layout.declared_nodes]
-    if "channel" in effect.where:
-        return [load.node for load in layout.loads_of(effect.where["channel"])]
-    return [layout.sensor_node(effect.where["sensor"])]
-
-
-def _missing_heat(search: Search, node: str) -> Json:
-    """Return the latent heat on a node of the declared model, with its band, and what the effects say it is."""
-    fit = search.base.fit
-    nominal = fit.nominals[-1]
-    problem = fit.problem.with_network(fit.network)
-    states, heat, std = smoothed_states(problem, fit.latent, nominal)
-    at = nominal.segment.forcing.sample_step[:-1]
-    keep = at[_thin(at.size)]
-    position = fit.problem.network.layout.node(node)
-    record = nominal.segment.record
-    time_s = nominal.segment.forcing.stage_time_s[keep, 0]
-    said = _effect_heat(search, node, states)
+def _missing_heat(heat: NodeHeat, record: Record) -> Json:
+    """Return the heat that a node of the declared model lacks, with its band, and what the effects say it is."""
+    keep = _thin(heat.time_s.size)
     return {
-        "node": node,
-        "time": _axis(record, time_s),
-        "temperature_K": _listed(states[keep, position]),
-        "mean_W": _listed(heat[keep, position]),
-        "std_W": _listed(std[keep, position]),
-        "effect_W": None if said is None else _listed(said[keep]),
+        "node": heat.node,
+        "time": _axis(record, heat.time_s[keep]),
+        "temperature_K": _listed(heat.temperature_K[keep]),
+        "mean_W": _listed(heat.mean_W[keep]),
+        "std_W": _listed(heat.std_W[keep]),
+        "effect_W": None if heat.effect_W is None else _listed(heat.effect_W[keep]),
+        "law": None if heat.law is None else _law(heat.law, heat.temperature_K),
     }
 
 
-def _effect_heat(search: Search, node: str, states_K: FloatArray) -> FloatArray | None:
-    """Return the heat of all findings into a node, (n_steps,), at the smoothed temperatures; None without findings."""
-    if not search.findings:
-        return None
-    network = search.trial.calibration.network
-    segment = search.trial.fit.problem.segments[-1]
-    values = network.parameters.values
-    path = search.trial.calibration.optimum.fit.trajectories[-1]
-    stages = path.stages_K.copy()
-    declared = search.base.fit.problem.n_nodes
-    stages[:, :, :declared] = states_K[1:, None, :]
-    forcing = segment.forcing
-    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(0, forcing.n_steps))
-    along: Along = forcing.along(stages.reshape(-1, stages.shape[2]), boundaries, 0, forcing.n_steps)
-    position = network.layout.node(node)
-    total = np.zeros(2 * forcing.n_steps)
-    for effect in search.trial.effects:
-        for term in effect.addition(network.layout).terms:
-            part = term.evaluate(along, values[network.term_index(term)])
-            for local, index in enumerate(part.nodes):
-                if index == position:
-                    total += part.heat_W[:, local]
-    return total.reshape(-1, 2)[:, 1]
+def _law(law: ForcePolynomial, visited_K: FloatArray) -> Json:
+    """Return the missing heat over the visited temperatures, as a curve with its band."""
+    grid = np.linspace(float(visited_K.min()), float(visited_K.max()), LAW_POINTS)
+    predicted = law.predict(grid)
+    return {
+        "degree": law.basis.degree,
+        "temperature_K": _listed(grid),
+        "mean_W": _listed(predicted.mean_W),
+        "std_W": _listed(predicted.std_W),
+    }
 
 
 def _network(model: CalibratedModel) -> Json:

@@ -1,0 +1,275 @@
+"""A second, independent witness: the heat that the declared model lacks, as a Gaussian process sees it.
+
+The search weighs named effects against each other. The latent force knows none of them: it takes the declared network at
+its fitted parameters and smooths whatever heat must have flowed into the nodes for the readings to be what they are
+(Kouw et al., CCTA 2024, eqs. 5-29). Where both tell the same, a finding does not hang on the search alone.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin_core._typing import FloatArray, Json
+from twin_core.calibrate.latent_heat import HeatFit, Nominal, floor_K2
+from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
+from twin_core.discover.search import Search
+from twin_core.errors import TwinError
+from twin_core.gp.kernels import Matern
+from twin_core.latent_force.model import ForceModel
+from twin_core.latent_force.network import linearise_network, on_grid
+from twin_core.latent_force.polynomial import ForcePolynomial
+from twin_core.latent_force.regression import learn_heat_flow
+from twin_core.latent_force.smooth import LatentForce, smooth_extended
+from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.model import Network
+from twin_core.simulate.forcing import Forcing
+
+MAX_WORK = 6e6
+"""Steps times squared states that are smoothed at most: beyond, the witness takes the end of the record alone."""
+MAX_LINEARISATIONS = 3
+MAX_DEGREE = 4
+SMALLEST_SHARE = 0.02
+"""Size of the latent force on a node of interest at least, as a share of the heat that passes through the node. What the
+calibration sized to nothing elsewhere carries no force at all."""
+CORRELATED, ALIKE = 0.8, 0.5
+"""Correlation from which, and rms difference (as a share of the effect's heat) up to which, both witnesses agree."""
+BAND = 2.0
+"""Standard deviations within which a difference is no disagreement, and below which a heat is not seen."""
+
+
+@dataclass(frozen=True)
+class NodeHeat:
+    """What the witness says about one node.
+
+    Attributes
+    ----------
+    node
+        Its name.
+    time_s : (n_steps,)
+        Ends of the steps.
+    temperature_K, mean_W, std_W : (n_steps,)
+        Smoothed temperature and missing heat.
+    effect_W : (n_steps,), optional
+        What the findings say that it is.
+    law
+        The missing heat over temperature; None where the data do not support that it repeats with temperature.
+    turnover_W
+        Mean heat that passes through the node: half of all flows' magnitudes.
+    """
+
+    node: str
+    time_s: FloatArray
+    temperature_K: FloatArray
+    mean_W: FloatArray
+    std_W: FloatArray
+    effect_W: FloatArray | None
+    law: ForcePolynomial | None
+    turnover_W: float
+
+    @property
+    def band_W(self) -> float:
+        """Root mean square of the standard deviation."""
+        return _rms(self.std_W)
+
+    @property
+    def correlation(self) -> float | None:
+        """Correlation of the findings' heat with the missing heat; None where either is constant or there is none."""
+        if self.effect_W is None or min(np.ptp(self.effect_W), np.ptp(self.mean_W)) <= 1e-9 * _rms(self.mean_W):
+            return None
+        return float(np.corrcoef(self.effect_W, self.mean_W)[0, 1])
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether the findings' heat is the missing heat; None without one, or where the band is wider than it."""
+        if self.effect_W is None or _rms(self.effect_W) < BAND * self.band_W:
+            return None
+        apart = _rms(self.effect_W - self.mean_W)
+        alike = apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
+        return alike or (self.correlation or 0.0) >= CORRELATED
+
+    def row(self) -> Json:
+        """Return the figures for a report."""
+        return {
+            "node": self.node,
+            "mean_W": float(self.mean_W.mean()),
+            "std_W": self.band_W,
+            "share_of_turnover": _rms(self.mean_W) / self.turnover_W if self.turnover_W > 0 else None,
+            "correlation_with_effect": self.correlation,
+            "agrees": self.agrees,
+        }
+
+    def words(self) -> str:
+        """Return one sentence."""
+        seen = (
+            f"Independent latent force at {self.node}: the declared model lacks {self.mean_W.mean():.3g} W on average, "
+            f"swinging by {self.mean_W.std():.2g} W (band {self.band_W:.2g} W)"
+        )
+        if self.effect_W is None:
+            return f"{seen}."
+        said = f"the added effects supply {self.effect_W.mean():.3g} W"
+        if self.correlation is not None:
+            said += f", correlation {self.correlation:.2f}"
+        verdict = {
+            True: "both agree",
+            False: "they disagree, the declared parameters may have taken up a part",
+            None: "the band is too wide to tell",
+        }[self.agrees]
+        return f"{seen}; {said}: {verdict}."
+
+
+@dataclass(frozen=True)
+class Witness:
+    """The nodes of interest, and what could not be told, in words."""
+
+    heats: tuple[NodeHeat, ...]
+    notices: tuple[str, ...] = ()
+
+    def rows(self) -> list[Json]:
+        """Return the figures for a report, one row per node."""
+        return [heat.row() for heat in self.heats]
+
+    def words(self) -> list[str]:
+        """Return one sentence per node."""
+        return [heat.words() for heat in self.heats]
+
+
+def bear_witness(search: Search) -> Witness:
+    """Smooth the missing heat at the nodes of interest of the declared model, over the last training segment.
+
+    Trouble with the numbers is told in the notices, never raised: the finding stands without its witness.
+
+    Parameters
+    ----------
+    search
+        A finished search; its base is the declared model.
+    """
+    nodes = nodes_of_interest(search)
+    try:
+        force, model, observations, values, view = _smoothed(search.base.fit, nodes)
+    except (TwinError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return Witness((), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",))
+    laws, notices = _laws(model, observations, values, force)
+    states = force.temperature_K[1:]
+    effect, turnover = effect_heat(search, states, view.first_step), view.turnover_W(search.base.fit.network, states)
+    heats = []
+    for node in nodes:
+        at = search.base.fit.network.nodes.index(node)
+        k = force.nodes.index(at)
+        mean, std = force.mean_W[1:, k], force.std_W[1:, k]
+        if not (np.isfinite(mean).all() and np.isfinite(std).all()):
+            notices.append(f"missing heat at {node}: the latent force is not finite")
+            continue
+        said = None if effect is None or np.isnan(effect[:, at]).any() else effect[:, at]
+        time_s = view.forcing.stage_time_s[:, 1]
+        heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at])))
+    return Witness(tuple(heats), tuple(notices))
+
+
+def told_by(witness: Witness, report: Json) -> Json:
+    """Return what a witness adds to a report: its figures, its sentences after the words, its notices after the others."""
+    return {
+        "witness": witness.rows(),
+        "words": [*report["words"], *witness.words()],
+        "notices": [*report["notices"], *witness.notices],
+    }
+
+
+@dataclass(frozen=True)
+class _View:
+    """The steps of a segment that are smoothed: ``forcing`` begins at its step ``first_step``."""
+
+    forcing: Forcing
+    first_step: int
+
+    @classmethod
+    def of(cls, forcing: Forcing, n_states: int) -> "_View":
+        """Return the end of a forcing that is not too much work."""
+        first = max(0, forcing.n_steps - max(int(MAX_WORK / n_states**2), 2))
+        at = forcing.sample_step
+        window = replace(
+            forcing,
+            start_s=forcing.start_s if first == 0 else float(forcing.stage_time_s[first - 1, 1]),
+            step_s=forcing.step_s[first:],
+            stage_time_s=forcing.stage_time_s[first:],
+            sample_step=at[at >= first] - first,
+            boundaries_K=forcing.boundaries_K[first:],
+            inputs={name: series[first:] for name, series in forcing.inputs.items()},
+            sun_factor=forcing.sun_factor[first:],
+        )
+        return cls(window, first)
+
+    def turnover_W(self, network: Network, states_K: FloatArray) -> FloatArray:
+        """Return the mean heat that passes through each node at the ends of the steps, (n_nodes,)."""
+        forcing, values = self.forcing, network.parameters.values
+        boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(0, forcing.n_steps))
+        along = forcing.along(np.repeat(states_K, 2, axis=0), boundaries, 0, forcing.n_steps)
+        total = np.zeros(states_K.shape[1])
+        for term in network.terms:
+            part = term.evaluate(along, values[network.term_index(term)])
+            np.add.at(total, list(part.nodes), 0.5 * np.abs(part.heat_W[1::2]).mean(axis=0))
+        return total
+
+
+def _smoothed(fit: HeatFit, nodes: Sequence[str]) -> tuple[LatentForce, ForceModel, FloatArray, FloatArray, _View]:
+    """Return the smoothed forces, their model about the smoothed temperatures, readings, hyperparameters and steps."""
+    nominal, network = fit.nominals[-1], fit.network
+    view = _View.of(nominal.segment.forcing, 2 * len(network.nodes))
+    states = np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])[view.first_step :]
+    turnover = view.turnover_W(network, states[1:])
+    watched = [network.nodes.index(node) for node in nodes]
+    std = fit.latent.std_W.copy()
+    std[watched] = np.maximum(std[watched], np.maximum(SMALLEST_SHARE * turnover[watched], 1e-6))
+    at = [i for i in range(std.size) if i in watched or std[i] > 1e-4 * turnover[i]]
+    about = linearise_network(network, view.forcing)
+    model = _model(fit, nominal, view, at, states)
+    values = np.ravel([[std[i], fit.latent.length_s] for i in at])
+    readings = _readings(network, nominal)[nominal.segment.forcing.sample_step >= view.first_step]
+    observations = on_grid(view.forcing, readings)
+    force = smooth_extended(model, about, observations, values, max_linearisations=MAX_LINEARISATIONS)
+    final = about(force.temperature_K)
+    return force, replace(model, network=lambda _: final), observations, values, view
+
+
+def _model(fit: HeatFit, nominal: Nominal, view: _View, at: Sequence[int], states_K: FloatArray) -> ForceModel:
+    """Return the declared network with a Matérn-1/2 force (the paper's) on some nodes."""
+    network, segment = fit.network, nominal.segment
+    observation = np.zeros((network.sensor_node.size, len(network.nodes)))
+    observation[np.arange(network.sensor_node.size), network.sensor_node] = 1.0
+    return ForceModel.build(
+        linearise_network(network, view.forcing)(states_K),
+        at,
+        Matern(1),
+        observation=observation,
+        noise_std_K=fit.problem.noise_K,
+        prior_mean_K=segment.start_prior_K if view.first_step == 0 else states_K[0],
+        prior_std_K=segment.start_std_K,
+        shared=False,
+        drift_K2_per_s=floor_K2(fit.problem) / float(np.median(view.forcing.step_s)),
+    )
+
+
+def _readings(network: Network, nominal: Nominal) -> FloatArray:
+    """Return the measured temperatures without the network's own reading faults, (n_samples, n_sensors)."""
+    read, values = nominal.segment.measured_K.copy(), network.parameters.values
+    for term in network.readings:
+        part = term.evaluate(nominal.segment.record.time_s, values[network.term_index(term)])
+        read[:, part.sensor] -= part.offset_K
+    return read
+
+
+def _laws(
+    model: ForceModel, observations: FloatArray, values: FloatArray, force: LatentForce
+) -> tuple[dict[int, ForcePolynomial], list[str]]:
+    """Return node -> polynomial of its temperature, where the evidence supports that the heat repeats with it."""
+    try:
+        learned = learn_heat_flow(model, observations, values, force, max_degree=MAX_DEGREE)
+    except (TwinError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return {}, [f"missing heat over temperature: no regression ({error})"]
+    if not learned.log_bayes_factor > 0.0:
+        return {}, []
+    return dict(zip(force.nodes, learned.polynomials, strict=True)), []
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
