@@ -7,6 +7,7 @@ from collections.abc import Callable
 import uvicorn
 
 from service.app import create_app
+from service.patience import patient
 from service.settings import Settings
 from service.store.database import Database
 from twin_core.errors import TwinError
@@ -41,6 +42,7 @@ def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> 
         app,
         log_config=None,
         access_log=False,
+        http=patient(settings.body_timeout_s),
         ws="websockets-sansio",
         lifespan="on",
         timeout_keep_alive=30,

@@ -27,7 +27,9 @@ class Settings(BaseSettings):
     database_url: str = Field("sqlite:///thermal-twin.sqlite3", description="Where everything is stored.")
     api_keys: SecretStr = Field(SecretStr(""), description="role:key pairs separated by commas.")
     max_body_bytes: int = Field(16 * MIB, ge=1024, description="Largest request body, after decompression.")
-    body_timeout_s: float = Field(30.0, gt=0, description="Longest wait for a request body (plus 32 KiB/s).")
+    body_timeout_s: float = Field(
+        30.0, gt=0, description="Longest wait for a request head, or a body (plus 1 s per 32 KiB)."
+    )
     stream_buffer: int = Field(
         1000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
     )

@@ -32,6 +32,8 @@ VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
 LEAST_VALIDATION = 20
 LEAST_SAMPLES = 20
+MOST_WAITING = 16
+"""Most jobs of one twin that may be queued or running."""
 
 Json = dict[str, Any]
 
@@ -66,7 +68,9 @@ class Jobs:
         self._running: dict[str, _Running] = {}
 
     async def start(self, twin: Entry, kind: str, request: Json) -> JobRow:
-        """Queue a job and return it."""
+        """Queue a job and return it; Problem 429 if too many wait already."""
+        if sum(running.twin == twin.key for running in self._running.values()) >= MOST_WAITING:
+            raise Problem(429, f"{MOST_WAITING} jobs of '{twin.name}' have not ended yet; wait for them or cancel some")
         job = uuid.uuid4().hex[:12]
         row = await self._database.write(jobs.create, twin.key, job, kind, request)
         running = _Running(twin.key, Cancel())
