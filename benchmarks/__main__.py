@@ -2,9 +2,10 @@
 
 import sys
 
-from benchmarks import demo_seeds, measured_sets
+from benchmarks import demo_seeds, measured_sets, readme
 
 if __name__ == "__main__":
     sys.argv = sys.argv[:1]
     demo_seeds.main()
     measured_sets.main()
+    readme.refresh()

@@ -5,11 +5,24 @@ from typing import Self
 
 import numpy as np
 
+from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import TableLoad
 
-KNOT_QUANTILES = (0.0, 0.25, 0.5, 0.75, 1.0)
+N_KNOTS = 6
+MIN_SHARE = 0.02
+"""An inner knot needs this share of the samples near it, or its value would be a guess."""
+
+
+def even_knots(series: FloatArray) -> tuple[float, ...]:
+    """Return knots spread evenly over the visited range, ends included, without those that few samples are near."""
+    knots = np.linspace(float(series.min()), float(series.max()), N_KNOTS)
+    nearest = np.argmin(np.abs(series[:, None] - knots), axis=1)
+    share = np.bincount(nearest, minlength=N_KNOTS) / series.size
+    kept = share > MIN_SHARE
+    kept[[0, -1]] = True
+    return tuple(float(k) for k in knots[kept])
 
 
 class ChannelHeatLoad(Effect):
@@ -52,7 +65,7 @@ class ChannelHeatLoad(Effect):
         levels = survey.layout.spec.channels[name].levels or np.unique(series).size <= 6
         knots = survey.channel_levels.get(name) or tuple(np.unique(series))
         if not levels:
-            knots = tuple(float(k) for k in np.unique(np.quantile(series, KNOT_QUANTILES)))
+            knots = even_knots(series)
         if len(knots) >= 2:
             values = {f"values_W[{i}]": 0.0 for i in range(len(knots))}
             yield cls(where, values, {"knots": knots, "levels": bool(levels)})
