@@ -1,0 +1,150 @@
+"""The witness sees a heat that SciPy put in, says so in figures and words, and never stands in the way."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twin_core.calibrate.second_order import fit_network
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
+from twin_core.discover import witness as module
+from twin_core.discover.confirm import Trial
+from twin_core.discover.search import Search
+from twin_core.discover.witness import NodeHeat, bear_witness, told_by
+from twin_core.errors import ModelError
+from twin_core.network.spec import load_spec
+from twin_core.telemetry import Record
+
+TIMES = np.arange(0.0, 40000.0, 100.0)
+SPEC = {
+    "twin": "t",
+    "boundaries": {"space": {"value_K": 3.0}},
+    "channels": {
+        "T_a": {"kind": "temperature", "unit": "K"},
+        "T_b": {"kind": "temperature", "unit": "K"},
+        "Q": {"kind": "power", "unit": "W", "interpolation": "linear"},
+    },
+    "nodes": [
+        {"id": "a", "sensor": "T_a", "capacity_J_per_K": {"value": 800.0}},
+        {"id": "b", "sensor": "T_b", "capacity_J_per_K": {"value": 2000.0}},
+    ],
+    "conductors": [{"between": ["a", "b"], "conductance_W_per_K": {"value": 1.5}}],
+    "radiators": [{"node": "b", "emissivity": 0.8, "area_m2": 0.2, "sink": "space"}],
+    "loads": [{"channel": "Q", "node": "a"}],
+}
+POWER = 30.0 + 20.0 * np.sin(TIMES / 1500.0)
+
+
+def _hidden(time_s):
+    return 4.0 + 3.0 * np.sin(2.0 * np.pi * np.asarray(time_s) / 9000.0)
+
+
+def _rates(t, x):
+    exchange = 1.5 * (x[1] - x[0])
+    radiated = SIGMA * 0.8 * 0.2 * (3.0**4 - x[1] ** 4)
+    return [(np.interp(t, TIMES, POWER) + exchange) / 800.0, (-exchange + radiated + _hidden(t)) / 2000.0]
+
+
+@pytest.fixture(scope="module")
+def search() -> Search:
+    run = solve_ivp(_rates, TIMES[[0, -1]], [265.0, 255.0], t_eval=TIMES, rtol=1e-9, atol=1e-9, max_step=100.0)
+    noisy = run.y.T + np.random.default_rng(4).normal(0.0, 0.02, (TIMES.size, 2))
+    record = Record(TIMES, {"T_a": noisy[:, 0], "T_b": noisy[:, 1], "Q": POWER})
+    fit, calibration = fit_network(load_spec(SPEC), [record])
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    return Search(base, base)
+
+
+def test_hidden_heat_is_seen_where_it_is(search):
+    told = bear_witness(search)
+    assert not told.notices
+    heats = {heat.node: heat for heat in told.heats}
+    assert set(heats) == {"a", "b"}
+    truth, seen = _hidden(heats["b"].time_s), heats["b"]
+    assert np.corrcoef(truth, seen.mean_W)[0, 1] > 0.97
+    assert np.mean(np.abs(seen.mean_W - truth) < 2.0 * seen.std_W) > 0.85
+    assert np.mean(np.abs(heats["a"].mean_W) < 2.0 * heats["a"].std_W) > 0.85
+    # All heat passes through b by its radiator.
+    radiated = SIGMA * 0.8 * 0.2 * np.mean(seen.temperature_K**4)
+    assert seen.turnover_W == pytest.approx(radiated, rel=0.15)
+
+
+def test_without_findings_there_is_nothing_to_agree_with(search):
+    report = {"words": ["before"], "notices": ["old"]}
+    added = told_by(bear_witness(search), report)
+    row = next(r for r in added["witness"] if r["node"] == "b")
+    assert row["agrees"] is None and row["correlation_with_effect"] is None
+    assert row["mean_W"] == pytest.approx(4.0, abs=1.5)
+    assert added["words"][0] == "before" and "latent force at b: the declared model lacks" in " ".join(added["words"])
+    assert added["notices"] == ["old"] and report["words"] == ["before"]
+
+
+def test_long_records_are_seen_from_their_end(search, monkeypatch):
+    whole = {heat.node: heat for heat in bear_witness(search).heats}
+    monkeypatch.setattr(module, "MAX_WORK", 16.0 * 200)
+    ends = {heat.node: heat for heat in bear_witness(search).heats}
+    for node, heat in ends.items():
+        assert heat.time_s.size == 200 and heat.time_s[-1] == TIMES[-1]
+        late = slice(-100, None)
+        apart = np.abs(heat.mean_W[late] - whole[node].mean_W[late])
+        assert (apart < 0.5 * heat.std_W[late]).all()
+
+
+@pytest.mark.parametrize(
+    "error", [ModelError("singular"), np.linalg.LinAlgError("singular"), FloatingPointError("nan")]
+)
+def test_trouble_is_told_not_raised(search, monkeypatch, error):
+    def fail(*_args, **_options):
+        raise error
+
+    monkeypatch.setattr(module, "learn_heat_flow", fail)
+    told = bear_witness(search)
+    assert len(told.heats) == 2 and all(heat.law is None for heat in told.heats) and "no regression" in told.notices[0]
+    monkeypatch.setattr(module, "smooth_extended", fail)
+    told = bear_witness(search)
+    assert told.heats == () and "could not be smoothed" in told.notices[0]
+    assert told.rows() == [] and told.words() == []
+
+
+def _heat(effect_W, mean_W, std_W=0.5) -> NodeHeat:
+    steps = np.arange(50.0)
+    full = None if effect_W is None else effect_W * np.ones(50)
+    return NodeHeat("n", steps, 280.0 + steps, mean_W * np.ones(50), std_W * np.ones(50), full, None, 10.0)
+
+
+WAVE = np.sin(np.arange(50.0) / 5.0)
+
+
+@pytest.mark.parametrize(
+    ("effect_W", "mean_W", "std_W", "agrees", "words"),
+    [
+        (5.0 + WAVE, 5.2 + WAVE, 0.5, True, "both agree"),
+        (5.0, 5.2 + WAVE, 0.5, True, "both agree"),
+        (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "both agree"),
+        (5.0 + WAVE, -4.0 - WAVE, 0.5, False, "disagree"),
+        (0.3 * WAVE, -4.0 + 0.3 * WAVE, 2.0, None, "too wide"),
+        (None, 4.0, 0.5, None, "on average"),
+    ],
+)
+def test_agreement(effect_W, mean_W, std_W, agrees, words):
+    heat = _heat(effect_W, mean_W, std_W)
+    assert heat.agrees is agrees and words in heat.words()
+    row = heat.row()
+    assert row["share_of_turnover"] == pytest.approx(np.sqrt(np.mean((mean_W * np.ones(50)) ** 2)) / 10.0)
+    if isinstance(effect_W, np.ndarray) and isinstance(mean_W, np.ndarray):
+        assert row["correlation_with_effect"] == pytest.approx(np.corrcoef(effect_W, mean_W)[0, 1])
+    else:
+        assert row["correlation_with_effect"] is None
+
+
+def test_forces_that_are_not_finite_are_left_out(search, monkeypatch):
+    smooth = module.smooth_extended
+
+    def spoilt(*args, **options):
+        found = smooth(*args, **options)
+        found.mean_W[3, 0] = np.nan
+        return found
+
+    monkeypatch.setattr(module, "smooth_extended", spoilt)
+    told = bear_witness(search)
+    assert len(told.heats) == 1 and any("not finite" in notice for notice in told.notices)
+    assert told.heats[0].node == "b"
