@@ -10,6 +10,7 @@ from service.app import create_app
 from service.patience import patient
 from service.settings import Settings
 from service.store.database import Database
+from service.workbench import CoreWorkbench, Workbench
 from twin_core.errors import TwinError
 
 SHUTDOWN_S = 10
@@ -19,7 +20,11 @@ class ServerError(TwinError):
     """The server cannot start."""
 
 
-def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> None:
+def serve(
+    settings: Settings,
+    on_ready: Callable[[str], None] | None = None,
+    workbench: type[Workbench] = CoreWorkbench,
+) -> None:
     """Serve until interrupted.
 
     Parameters
@@ -28,6 +33,8 @@ def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> 
         Where to listen and what to use; port 0 picks a free one.
     on_ready
         Called with the URL once the service answers.
+    workbench
+        Who does the science.
 
     Raises
     ------
@@ -37,7 +44,7 @@ def serve(settings: Settings, on_ready: Callable[[str], None] | None = None) -> 
     listener = _listen(settings)
     database = Database(settings.database_path)
     host, port = listener.getsockname()[:2]
-    app = create_app(settings, database)
+    app = create_app(settings, database, workbench)
     config = uvicorn.Config(
         app,
         log_config=None,

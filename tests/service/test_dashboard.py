@@ -1,0 +1,121 @@
+"""The dashboard as a person uses it: real server, real Chromium, samples arriving, clicks and keys."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.service.browser import BINARY, Browser
+from tests.service.conftest import SPEC
+from tests.service.server import Server
+
+pytestmark = [pytest.mark.browser, pytest.mark.e2e, pytest.mark.skipif(BINARY is None, reason="no Chromium here")]
+
+SCRIPT = (
+    "import sys; from service.server import serve; from service.settings import read_settings;"
+    "from tests.service.fakes import FakeWorkbench;"
+    "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)"
+)
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with Server(tmp_path, command=SCRIPT) as running:
+        yield running
+
+
+@pytest.fixture
+def page(server: Server, tmp_path: Path) -> Iterator[Browser]:
+    with Browser(tmp_path / "profile") as browser:
+        browser.open(server.url)
+        yield browser
+
+
+def send(server: Server, first: int, count: int = 200) -> None:
+    times = [60.0 * k for k in range(first, first + count)]
+    jumps = [290.0 + 0.001 * k + (9.0 * (k % 2) if 150 <= k < 180 else 0.0) for k in range(first, first + count)]
+    values = {"T_px": jumps, "T_tank": [15.0] * count, "Q_px": [0.5] * count}
+    server.client().ingest("benchsat", times, values)
+
+
+def test_a_day_at_the_console(server: Server, page: Browser) -> None:
+    page.until("!document.getElementById('empty').hidden")
+    assert "curl" in page.text("#empty-code")
+
+    server.client().register(SPEC)
+    page.until("document.getElementById('twin').value === 'benchsat'")
+    page.until("document.getElementById('temperatures').innerText.includes('No telemetry yet')")
+    send(server, 0)
+    page.until("document.querySelector('#temperatures canvas')")
+    assert "200" in page.text("#facts")
+    assert "calibrate" in page.text("#residuals")
+
+    page.click("#calibrate")
+    page.until("document.getElementById('models').innerText.includes('active')")
+    page.until("document.querySelector('#residuals canvas')")
+    page.until("document.getElementById('now-note').innerText.includes('expected in')")
+    page.until("document.getElementById('anomalies').innerText.includes('T_px')")
+    assert "17.05" in page.text("#now")  # 290.2 K, shown in the unit of the other sensor
+    assert page.evaluate("document.querySelectorAll('#network circle.node').length") == 1
+
+    send(server, 200)
+    page.until("document.getElementById('facts').innerText.includes('400')")
+    page.until("document.getElementById('now').innerText.includes('17.25')")
+
+    page.click("#diagnose")
+    page.until("document.querySelector('#jobs').innerText.includes('constant heat load')")
+    page.until("[...document.querySelectorAll('#jobs button')].some((b) => b.innerText === 'Report')")
+    page.click("#jobs li:first-child button")
+    page.until("document.getElementById('report-dialog').open")
+    assert "found" in page.evaluate("document.getElementById('report').srcdoc")
+    page.click("#report-dialog button")
+    page.until("!document.getElementById('report-dialog').open")
+
+    page.click("#models tbody tr:first-child button")
+    page.until("document.querySelector('#models tbody tr:first-child').innerText.includes('active')")
+    assert page.troubles == []
+
+
+def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
+    server.client().register(SPEC)
+    send(server, 0)
+    page.until("document.querySelector('#temperatures canvas')")
+
+    page.press("t")
+    first = page.evaluate("document.documentElement.dataset.theme")
+    page.press("t")
+    assert {first, page.evaluate("document.documentElement.dataset.theme")} == {"light", "dark"}
+    unit = page.text("#unit")
+    page.press("u")
+    assert {unit, page.text("#unit")} == {"K", "°C"}
+    page.press("1")
+    assert page.text("#ranges [aria-pressed=true]") == "1 h"
+    page.until("document.getElementById('plot-note').innerText.startsWith('61 samples')")
+    page.drag("#temperatures .u-over", 0.2, 0.6)
+    page.until("!document.querySelector('#ranges [aria-pressed=true]')")
+    page.press("5")
+    page.until("document.getElementById('plot-note').innerText.startsWith('200 samples')")
+    page.press("?")
+    page.until("document.getElementById('help-dialog').open")
+    page.click("#help-dialog button")
+    page.click("#legend button")
+    assert page.evaluate("document.querySelector('#legend button').getAttribute('aria-pressed')") == "false"
+
+    for width in (360, 820, 1400):
+        page.resize(width, 900)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert page.troubles == []
+
+
+def test_a_key_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
+    with Server(tmp_path, command=SCRIPT, api_keys="read:sesame,operate:o") as server:
+        server.client("o").register(SPEC)
+        with Browser(tmp_path / "profile") as page:
+            page.open(server.url)
+            page.until("document.getElementById('key-dialog').open")
+            page.evaluate("document.getElementById('key').value = 'sesame'")
+            page.click("#key-dialog button")
+            page.until("document.getElementById('twin').value === 'benchsat'")
+            page.until("document.getElementById('link').dataset.state === 'live'")
+            page.click("#calibrate")
+            page.until("document.getElementById('toasts').innerText.includes('operate')")
