@@ -12,6 +12,7 @@ from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import TwinSpec, dump_spec, load_spec
+from twin_core.parameters.transforms import Identity
 
 FORMAT = "thermal-twin-model/1"
 
@@ -121,14 +122,38 @@ class CalibratedModel:
         return model
 
     def _check(self) -> None:
-        """Refuse a model whose values do not fit its network."""
-        try:
-            names = self.network().parameters.index
-        except ModelError as error:
-            raise SpecError(f"effects: {error}") from error
-        lacking = [name for name in names if name not in self.values]
-        if lacking:
-            raise SpecError(f"values.{lacking[0]}: is missing from the model file")
+        """Refuse a model whose numbers are not numbers, or do not fit its network."""
+        positive = {
+            "noise_K": self.noise_K,
+            "misfit_length_s": self.misfit_length_s,
+            "": {"max_step_s": self.max_step_s},
+        }
+        for field_name, row in positive.items():
+            for name, value in row.items():
+                if not (np.isfinite(value) and value > 0.0):
+                    raise SpecError(f"{field_name}.{name}: must be a positive number".lstrip("."))
+        if not all(np.isfinite(value) and value >= 0.0 for value in self.misfit_K.values()):
+            raise SpecError("misfit_K: must be numbers of at least 0")
+        if not np.isfinite(self.covariance).all():
+            raise SpecError("covariance: holds a number that is not finite")
         wrong = [name for name, value in self.values.items() if not np.isfinite(value)]
         if wrong:
             raise SpecError(f"values.{wrong[0]}: is not a finite number")
+        self._check_network()
+
+    def _check_network(self) -> None:
+        """Refuse a model whose values do not fit its network."""
+        try:
+            parameters = self.network().parameters
+        except ModelError as error:
+            raise SpecError(f"effects: {error}") from error
+        except KeyError as error:
+            raise SpecError(f"effects: the setting '{error.args[0]}' is missing") from error
+        lacking = [name for name in parameters.index if name not in self.values]
+        if lacking:
+            raise SpecError(f"values.{lacking[0]}: is missing from the model file")
+        if self.free_names and self.free_names != parameters.free_names:
+            raise SpecError("free_names: are not the free parameters of the specification and its effects")
+        for parameter in parameters.parameters:
+            if not isinstance(parameter.transform, Identity) and not parameter.value > 0.0:
+                raise SpecError(f"values.{parameter.name}: must be positive")

@@ -15,7 +15,7 @@ from twin_core.effects.missing_conductor import MissingConductor
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
 from twin_core.effects.sensor_lag import SensorLag
-from twin_core.errors import SpecError
+from twin_core.errors import ModelError, SpecError
 
 REGISTRY: dict[str, type[Effect]] = {
     effect.name: effect
@@ -48,10 +48,21 @@ def effect_from_json(data: Any, position: int = 0) -> Effect:
         name = data.get("effect") if isinstance(data, dict) else data
         raise SpecError(f"{field}.effect: unknown effect {name!r} (known: {', '.join(REGISTRY)})")
     kind = REGISTRY[data["effect"]]
-    require(data.get("where", {}), kind.keys, kind.name)
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in data.get("settings", {}).items()}
-    effect = kind(dict(data["where"]), {k: float(v) for k, v in data.get("values", {}).items()}, settings)
-    lacking = [q.name for q in effect.qualities() if q.name not in effect.values]
+    parts = {part: data.get(part, {}) for part in ("where", "settings", "values")}
+    for part, given in parts.items():
+        if not isinstance(given, dict):
+            raise SpecError(f"{field}.{part}: must be a mapping")
+    try:
+        require(parts["where"], kind.keys, kind.name)
+        settings = {k: tuple(v) if isinstance(v, list) else v for k, v in parts["settings"].items()}
+        effect = kind(dict(parts["where"]), {k: float(v) for k, v in parts["values"].items()}, settings)
+        lacking = [q.name for q in effect.qualities() if q.name not in effect.values]
+    except ModelError as error:
+        raise SpecError(f"{field}: {error}") from error
+    except KeyError as error:
+        raise SpecError(f"{field}.settings.{error.args[0]}: is missing") from error
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"{field}.values: must be numbers ({error})") from error
     if lacking:
         raise SpecError(f"{field}.values.{lacking[0]}: is missing")
     return effect

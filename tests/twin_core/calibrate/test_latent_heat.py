@@ -6,11 +6,10 @@ from scipy.stats import multivariate_normal
 
 from tests.analytic import laplacian, linear_states
 from tests.helpers import at_named, central_difference, conductive_spec, record_of
+from twin_core.calibrate.latent_fit import fit_with_latent_heat, gauss_newton_step
 from twin_core.calibrate.latent_heat import (
     LatentHeat,
     Nominal,
-    fit_with_latent_heat,
-    gauss_newton_step,
     linearise,
     log_likelihood,
     parameter_columns,

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from twin_core.effects import REGISTRY, effect_from_json
-from twin_core.errors import TwinError
+from twin_core.errors import SpecError
 
 GOOD = {
     "effect": "leak_to_boundary",
@@ -31,7 +31,7 @@ GOOD = {
     ],
 )
 def test_damage_is_named(data: Any, message: str) -> None:
-    with pytest.raises(TwinError, match=message):
+    with pytest.raises(SpecError, match=message):
         effect_from_json(data, 3)
 
 

@@ -1,0 +1,68 @@
+"""Noise told from samples: the number that went in comes out, whatever the signal under it."""
+
+import numpy as np
+import pytest
+
+from tests.helpers import record_of
+from twin_core.calibrate.noise import FALLBACK_STD_K, difference_noise_K, quantum_K, sensor_noise_K
+from twin_core.network.spec import load_spec
+
+RNG_SIZE = 4000
+
+
+def noise(std_K: float, seed: int = 0, n: int = RNG_SIZE) -> np.ndarray:
+    return np.random.default_rng(seed).normal(0.0, std_K, n)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("std_K", [0.01, 0.2])
+def test_second_differences_see_the_noise_through_a_slow_signal(std_K: float) -> None:
+    slow = 290.0 + 10.0 * np.sin(np.arange(RNG_SIZE) / 300.0)
+    # A median of 4000 absolute values is within 4 % of its expectation in all but one case in a hundred.
+    assert difference_noise_K(slow + noise(std_K)) == pytest.approx(std_K, rel=0.05)
+
+
+def test_steps_and_gaps_do_not_count_as_noise() -> None:
+    stepped = 290.0 + 5.0 * (np.arange(RNG_SIZE) // 100 % 2) + noise(0.1)
+    stepped[np.random.default_rng(1).random(RNG_SIZE) < 0.2] = np.nan
+    assert difference_noise_K(stepped) == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.parametrize("column", [np.zeros(5), np.full(100, np.nan), np.array([])])
+def test_too_few_samples_tell_nothing(column: np.ndarray) -> None:
+    assert np.isnan(difference_noise_K(column))
+
+
+def test_a_quantised_series_shows_its_step() -> None:
+    signal = 290.0 + 3.0 * np.sin(np.arange(800) / 60.0)
+    assert quantum_K(np.round(signal / 0.25) * 0.25) == pytest.approx(0.25)
+    assert quantum_K(signal + noise(0.1, n=800)) == 0.0
+    assert quantum_K(np.full(50, 290.0)) == 0.0
+
+
+SPEC = load_spec(
+    {
+        "twin": "t",
+        "channels": {
+            "A": {"kind": "temperature", "unit": "K"},
+            "B": {"kind": "temperature", "unit": "degC", "noise_std": 0.05},
+            "C": {"kind": "temperature", "unit": "K", "noise_std": 0.01},
+        },
+        "nodes": [{"id": "n", "sensor": ["A", "B", "C"]}],
+    }
+)
+
+
+def test_a_declared_noise_is_believed_down_to_the_quantum() -> None:
+    signal = 290.0 + 3.0 * np.sin(np.arange(800) / 60.0)
+    coarse = np.round(signal / 0.5) * 0.5
+    record = record_of(np.arange(800.0), A=signal + noise(0.3, n=800), B=signal + noise(0.3, 1, 800), C=coarse)
+    found = sensor_noise_K(SPEC, [record])
+    assert found[0] == pytest.approx(0.3, rel=0.1)
+    assert found[1] == 0.05
+    assert found[2] == pytest.approx(0.5 / np.sqrt(12.0))
+
+
+def test_a_sensor_that_tells_nothing_gets_a_usual_noise() -> None:
+    found = sensor_noise_K(SPEC, [record_of(np.arange(4.0), A=290.0, B=290.0)])
+    np.testing.assert_array_equal(found, [FALLBACK_STD_K, 0.05, 0.01])

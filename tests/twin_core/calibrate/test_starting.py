@@ -1,0 +1,78 @@
+"""Where a calibration starts: levels, interpolated temperatures, and the order of magnitude of what nobody guessed."""
+
+import numpy as np
+import pytest
+
+from tests.analytic import laplacian, linear_states
+from tests.helpers import conductive_spec, record_of
+from twin_core.calibrate.problem import build_problem
+from twin_core.calibrate.starting import balance_start, channel_levels, filled_columns
+from twin_core.network.model import build_network
+from twin_core.network.spec import load_spec
+
+
+def test_levels_are_where_a_channel_rests() -> None:
+    rng = np.random.default_rng(0)
+    states = np.repeat(rng.choice([0.0, 5.0, 6.0], 60), 20)
+    slewing = states.copy()
+    slewing[::97] = rng.uniform(1.0, 4.0, slewing[::97].size)
+    record = record_of(np.arange(1200.0), mode=slewing + rng.normal(0.0, 1e-3, 1200))
+    np.testing.assert_allclose(channel_levels([record], "mode"), [0.0, 5.0, 6.0], atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("column", "expected"), [([3.0] * 9, (3.0,)), ([np.nan] * 9, ()), ([1.0, 2.0] * 8, (1.0, 2.0))]
+)
+def test_levels_of_simple_channels(column: list[float], expected: tuple[float, ...]) -> None:
+    assert channel_levels([record_of(np.arange(float(len(column))), mode=np.array(column))], "mode") == expected
+
+
+def test_levels_are_gathered_from_all_records() -> None:
+    parts = [record_of(np.arange(20.0), mode=2.0), record_of(np.arange(20.0), mode=1.0), record_of(np.arange(5.0))]
+    assert channel_levels(parts, "mode") == (1.0, 2.0)
+
+
+def chain_network(**fields: object) -> dict:
+    power = {"kind": "power", "unit": "W"}
+    data = conductive_spec(3, [(0, 1), (1, 2)], channels={"Q": power}, loads=[{"channel": "Q", "node": "n0"}], **fields)
+    for row in data["nodes"]:
+        del row["capacity_J_per_K"]
+    for row in data["conductors"]:
+        del row["conductance_W_per_K"]
+    return data
+
+
+def test_gaps_are_bridged_and_hidden_states_follow_their_neighbours() -> None:
+    data = chain_network()
+    del data["nodes"][1]["sensor"], data["channels"]["T1"]
+    network = build_network(load_spec(data))
+    measured = np.array([[280.0, 290.0], [np.nan, 292.0], [284.0, np.nan]])
+    filled = filled_columns(network, np.array([0.0, 1.0, 2.0]), measured, None)
+    np.testing.assert_allclose(filled[:, 0], [280.0, 282.0, 284.0])
+    np.testing.assert_allclose(filled[:, 2], [290.0, 292.0, 292.0])
+    np.testing.assert_allclose(filled[:, 1], 0.5 * (filled[:, 0] + filled[:, 2]))
+    held = filled_columns(network, np.array([0.0, 1.0, 2.0]), measured, np.array([1.0, 277.0, 3.0]))
+    np.testing.assert_array_equal(held[:, 1], 277.0)
+
+
+def test_integrated_balances_give_the_order_of_magnitude() -> None:
+    capacity, conductance = np.array([4.0e3, 2.0e4, 900.0]), [5.0, 0.4]
+    rng = np.random.default_rng(3)
+    time_s = 60.0 * np.arange(600)
+    heat = np.repeat(rng.choice([0.0, 50.0], 60), 10)
+    rates = -laplacian(3, [(0, 1), (1, 2)], conductance) / capacity[:, None]
+    states = linear_states(rates, np.outer(heat, [1.0 / capacity[0], 0.0, 0.0]), np.full(3, 290.0), time_s)
+    readings = {f"T{i}": states[:, i] + rng.normal(0, 0.02, 600) for i in range(3)}
+    problem = build_problem(
+        build_network(load_spec(chain_network())), [record_of(time_s, Q=heat, **readings)], np.full(3, 0.02)
+    )
+    found = balance_start(problem).as_dict()
+    truth = {f"C:n{i}": c for i, c in enumerate(capacity)} | {"G:n0|n1": 5.0, "G:n1|n2": 0.4}
+    for name, value in truth.items():
+        assert abs(np.log(found[name] / value)) < np.log(3.0), name
+
+
+def test_declared_guesses_are_kept() -> None:
+    network = build_network(load_spec(conductive_spec(2, [(0, 1)])))
+    record = record_of(60.0 * np.arange(30), T0=290.0, T1=280.0)
+    assert balance_start(build_problem(network, [record], np.ones(2))) == network.parameters
