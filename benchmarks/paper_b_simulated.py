@@ -12,6 +12,7 @@ from time import perf_counter
 import numpy as np
 from numpy.polynomial import Polynomial
 from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.gp.discretise import discretise
@@ -19,7 +20,7 @@ from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.kernels import Kernel, Matern, Values
 from twin_core.gp.smoother import smooth
 from twin_core.gp.state_space import LinearModel
-from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, fit_map
+from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, Posterior, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.polynomial import ForcePolynomial, regress_pointwise
@@ -33,6 +34,9 @@ TIMES = np.arange(1000.0)
 PAPER_KERNEL = Matern(1, decay=float(np.sqrt(3.0)))
 PRIORS = {"std": GammaPrior(5.0, 0.1), "length_s": GammaPrior(5.0, 0.1)}
 START = {"std": (3.0, 20.0), "length_s": (30.0, 300.0)}
+LATE_START = {"std": 4.0, "length_s": 300.0}
+PUBLISHED_STD_W = 20.0
+"""Around which the paper's figure 3 shows the posterior of the force's standard deviation."""
 HeatFlow = Callable[[FloatArray], FloatArray]
 
 
@@ -78,7 +82,7 @@ class PrintedModel(ForceModel):
         return transition, printed, *rest
 
 
-def force_model(kernel: Kernel, *, printed: bool = False) -> ForceModel:
+def force_model(kernel: Kernel, *, printed: bool = False, shared: bool = True) -> ForceModel:
     """Return the paper's model over the training record."""
     inputs = np.full((TIMES.size - 1, 2, 3), 2.0 * AMBIENT)
     inputs[TIMES[:-1] >= 100.0, :, 0] += HEAT_W
@@ -92,6 +96,7 @@ def force_model(kernel: Kernel, *, printed: bool = False) -> ForceModel:
         noise_std_K=np.full(3, np.sqrt(NOISE_VARIANCE)),
         prior_mean_K=np.full(3, AMBIENT),
         prior_std_K=1.0,
+        shared=shared,
         scheme="first-order" if printed else "exact",
     )
 
@@ -105,6 +110,7 @@ class Tally:
     force_coverage: list[float] = field(default_factory=list)
     fits: list[MapFit] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+    nats_at_published: list[float] = field(default_factory=list)
 
     def add_curve(self, polynomials: Sequence[ForcePolynomial], boundary: FloatArray) -> None:
         """Note simulation error and how much of the true curve the 90 % band covers over the visited range."""
@@ -177,8 +183,23 @@ def run_seed(seed: int, tallies: dict[str, Tally]) -> None:
     best = max(fits, key=lambda name: fits[name][1].log_posterior)
     for kind in ("mse_K2", "curve_coverage", "force_coverage"):
         getattr(tallies["by evidence"], kind).append(getattr(tallies[best], kind)[-1])
+    _other_posteriors(samples, fits["matern-1/2"], tallies)
     _run_printed(samples, boundary, tallies["printed"])
     tallies["residual"].mse_K2.append(residual_polynomial_mse(samples))
+
+
+def _other_posteriors(samples: FloatArray, ours: tuple[ForceModel, MapFit], tallies: dict[str, Tally]) -> None:
+    """Note the hyperparameters without a prior and one set per block, and what the published size costs."""
+    model, fit = ours
+    tallies["flat"].fits.append(fit_map(model, samples, {}, START))
+    apart = force_model(PAPER_KERNEL, shared=False)
+    priors, start = ({f"{k}[{node}]": v for node in range(3) for k, v in d.items()} for d in (PRIORS, LATE_START))
+    tallies["separate"].fits.append(fit_map(apart, samples, priors, start))
+    posterior = Posterior(model, samples, PRIORS)
+    found = minimize_scalar(
+        lambda log_length: -posterior.value(np.array([np.log(PUBLISHED_STD_W), log_length])), bounds=(1.0, 11.0)
+    )
+    tallies["matern-1/2"].nats_at_published.append(fit.log_posterior + float(found.fun))
 
 
 def _run_printed(samples: FloatArray, boundary: FloatArray, tally: Tally) -> None:
@@ -209,6 +230,7 @@ def _pointwise(force: LatentForce, boundary: FloatArray) -> list[ForcePolynomial
 def run(seeds: Sequence[int]) -> dict[str, Tally]:
     """Run all seeds; method -> tally. ``none`` simulates without any learned heat."""
     names = ("matern-1/2", "matern-3/2", "matern-5/2", "by evidence", "pointwise", "printed", "residual", "none")
+    names += ("flat", "separate")
     tallies = {name: Tally() for name in names}
     for seed in seeds:
         run_seed(seed, tallies)
