@@ -7,7 +7,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.identifiability import words
-from twin_core.calibrate.latent_heat import HeatFit, fit_with_latent_heat
+from twin_core.calibrate.latent_fit import fit_with_latent_heat
+from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem

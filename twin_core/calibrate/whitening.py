@@ -12,6 +12,79 @@ from twin_core._typing import BoolArray, FloatArray, IntArray
 
 
 @njit(cache=True, fastmath=True)
+def _predict_covariance(
+    full: FloatArray, cov: FloatArray, turned: FloatArray, keep: float, force: FloatArray, state: FloatArray
+) -> None:
+    """Advance the covariance of [temperatures, heats]: the heats only decay, so that half of the product is cheap."""
+    both = cov.shape[0]
+    n = both // 2
+    for i in range(both):
+        for j in range(both):
+            if i < n:
+                total = 0.0
+                for m in range(both):
+                    total += full[i, m] * cov[m, j]
+            else:
+                total = keep * cov[i, j]
+            turned[i, j] = total
+    for i in range(both):
+        for j in range(i + 1):
+            if j < n:
+                total = 0.0
+                for m in range(both):
+                    total += turned[i, m] * full[j, m]
+            else:
+                total = turned[i, j] * keep
+            cov[i, j] = total
+            cov[j, i] = total
+    for i in range(n):
+        cov[i, i] += state[i]
+        cov[n + i, n + i] += force[i] * (1.0 - keep * keep)
+
+
+@njit(cache=True, fastmath=True)
+def _predict_columns(full: FloatArray, mean: FloatArray, work: FloatArray, keep: float) -> None:
+    """Advance the mean of every column."""
+    both, n_columns = mean.shape
+    n = both // 2
+    for i in range(n):
+        for c in range(n_columns):
+            work[i, c] = 0.0
+        for j in range(both):
+            factor = full[i, j]
+            if factor != 0.0:
+                for c in range(n_columns):
+                    work[i, c] += factor * mean[j, c]
+    for i in range(n):
+        for c in range(n_columns):
+            mean[i, c] = work[i, c]
+            mean[n + i, c] *= keep
+
+
+@njit(cache=True, fastmath=True)
+def _condition(
+    o: int, noise: float, cov: FloatArray, mean: FloatArray, reading: FloatArray, out: FloatArray, gain: FloatArray
+) -> float:
+    """Condition every column on one sensor; write whitened innovations; return their common variance."""
+    both, n_columns = mean.shape
+    variance = cov[o, o] + noise
+    root = np.sqrt(variance)
+    for i in range(both):
+        gain[i] = cov[i, o] / variance
+    for c in range(n_columns):
+        out[c] = reading[c] - mean[o, c]
+    for i in range(both):
+        for c in range(n_columns):
+            mean[i, c] += gain[i] * out[c]
+        for j in range(i + 1):
+            cov[i, j] -= gain[i] * gain[j] * variance
+            cov[j, i] = cov[i, j]
+    for c in range(n_columns):
+        out[c] /= root
+    return variance
+
+
+@njit(cache=True, fastmath=True)
 def whiten_columns(
     transition: FloatArray,
     response: FloatArray,
@@ -53,84 +126,26 @@ def whiten_columns(
         Innovations over their standard deviation, zero where invalid; ln det of the covariance of the readings.
     """
     n_steps, n = transition.shape[0], transition.shape[1]
-    n_columns, n_sensors = columns.shape[2], observed.size
     out = np.zeros_like(columns)
-    both = 2 * n
-    cov = np.zeros((both, both))
+    cov, full, turned = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
+    mean, work, gain = np.zeros((2 * n, columns.shape[2])), np.empty((n, columns.shape[2])), np.empty(2 * n)
     for i in range(n):
         cov[i, i] = start_variance[i]
         cov[n + i, n + i] = force_variance[i]
-    mean = np.zeros((both, n_columns))
-    work = np.empty((both, n_columns))
-    full = np.zeros((both, both))
-    turned = np.empty((both, both))
-    gain = np.empty(both)
     log_det = 0.0
     for k in range(n_steps + 1):
         if k > 0:
-            for i in range(n):
-                for j in range(n):
-                    full[i, j] = transition[k - 1, i, j]
-                    full[i, n + j] = response[k - 1, i, j]
-                full[n + i, n + i] = keep[k - 1]
-            for i in range(n):
-                for j in range(both):
-                    total = 0.0
-                    for m in range(both):
-                        total += full[i, m] * cov[m, j]
-                    turned[i, j] = total
-            for i in range(n):
-                for j in range(both):
-                    turned[n + i, j] = keep[k - 1] * cov[n + i, j]
-            for i in range(both):
-                for j in range(i + 1):
-                    total = 0.0
-                    if j < n:
-                        for m in range(both):
-                            total += turned[i, m] * full[j, m]
-                    else:
-                        total = turned[i, j] * keep[k - 1]
-                    cov[i, j] = total
-                    cov[j, i] = total
-            for i in range(n):
-                cov[i, i] += state_variance[i]
-                cov[n + i, n + i] += force_variance[i] * (1.0 - keep[k - 1] * keep[k - 1])
-            for i in range(n):
-                for c in range(n_columns):
-                    work[i, c] = 0.0
-                for j in range(both):
-                    factor = full[i, j]
-                    if factor != 0.0:
-                        for c in range(n_columns):
-                            work[i, c] += factor * mean[j, c]
-            for i in range(n):
-                for c in range(n_columns):
-                    mean[i, c] = work[i, c]
-                    mean[n + i, c] *= keep[k - 1]
+            full[:n, :n] = transition[k - 1]
+            full[:n, n:] = response[k - 1]
+            _predict_covariance(full, cov, turned, keep[k - 1], force_variance, state_variance)
+            _predict_columns(full, mean, work, keep[k - 1])
         row = sample_of[k]
         if row < 0:
             continue
-        for s in range(n_sensors):
-            if not valid[row, s]:
-                continue
-            o = observed[s]
-            variance = cov[o, o] + noise_variance[s]
-            root = np.sqrt(variance)
-            log_det += np.log(variance)
-            for i in range(both):
-                gain[i] = cov[i, o] / variance
-            for c in range(n_columns):
-                innovation = columns[row, s, c] - mean[o, c]
-                out[row, s, c] = innovation / root
-                work[0, c] = innovation
-            for i in range(both):
-                factor = gain[i]
-                for c in range(n_columns):
-                    mean[i, c] += factor * work[0, c]
-            for i in range(both):
-                for j in range(i + 1):
-                    cov[i, j] -= gain[i] * gain[j] * variance
-                    cov[j, i] = cov[i, j]
+        for s in range(observed.size):
+            if valid[row, s]:
+                reading, whitened = columns[row, s], out[row, s]
+                log_det += np.log(_condition(observed[s], noise_variance[s], cov, mean, reading, whitened, gain))
     return out, log_det
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from twin_core._typing import FloatArray
-from twin_core.calibrate.latent_heat import HeatFit, first_size, fit_with_latent_heat, linearise, log_likelihood
+from twin_core.calibrate.latent_fit import fit_with_latent_heat
+from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
+from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian

@@ -1,0 +1,208 @@
+"""Calibration in the presence of undeclared heat: prediction errors instead of trajectories.
+
+The parameters follow by generalised least squares on the innovations of a filter in which every node carries a latent heat.
+They stay where the physics is, however much heat the declaration lacks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.latent_heat import (
+    HeatFit,
+    LatentHeat,
+    Nominal,
+    linearise,
+    log_likelihood,
+    parameter_columns,
+    smoothed_states,
+    states_of,
+    whiten,
+)
+from twin_core.calibrate.latent_size import LARGEST_LOG_STEP, SizeSearch, first_size, new_search
+from twin_core.calibrate.problem import Problem, Segment
+from twin_core.calibrate.starting import filled_columns
+
+LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
+"""Prior deviations of logarithmic parameters in the first passes, while the latent heat is still too large."""
+
+START_SHARES = (1.0, 0.03)
+"""Sizes of the latent heat that a fit starts from, as shares of a typical one."""
+
+SETTLED_NATS, SETTLED_LOG_STEP = 0.2, 0.3
+"""A pass that adds less than this to the log-likelihood, with steps of sizes this small, is the last."""
+
+
+def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
+    """Return temperatures at every grid point, (n_steps + 1, n_nodes), interpolated from the readings."""
+    network, at = problem.network, segment.forcing.sample_step
+    filled = filled_columns(network, segment.record.time_s, segment.measured_K, None)
+    grid = np.arange(segment.forcing.n_steps + 1)
+    return np.stack([np.interp(grid, at, column) for column in filled.T], axis=1)
+
+
+def _smoothing_pass(
+    problem: Problem, values: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal]
+) -> tuple[Nominal, ...]:
+    """Relinearise every segment about its smoothed temperatures and heat."""
+    fresh = []
+    for nominal in nominals:
+        states, heat, _ = smoothed_states(problem, latent, nominal)
+        fresh.append(linearise(problem, values, nominal.segment, states, heat[:-1]))
+    return tuple(fresh)
+
+
+def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> tuple[Nominal, ...]:
+    """Linearise every segment at other parameter values about the same temperatures and heat."""
+    return tuple(linearise(problem, values, n.segment, states_of(n), n.extra_W, n.steps.stages_K) for n in nominals)
+
+
+def gauss_newton_step(
+    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float = np.inf
+) -> tuple[FloatArray, FloatArray]:
+    """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free).
+
+    ``leash`` shortens the priors of logarithmic parameters for the early passes, in which the latent heat is still so
+    large that it could take over what conductances do.
+    """
+    parameters = problem.network.parameters
+    values = parameters.to_values(free)
+    std = leashed(problem, leash)
+    hessian = np.diag(1.0 / std**2)
+    gradient = (free - parameters.free) / std**2
+    for nominal in nominals:
+        columns = np.concatenate([parameter_columns(problem, values, nominal), nominal.residual_K[:, :, None]], axis=2)
+        whitened, _ = whiten(problem, latent, nominal, columns)
+        flat = whitened.reshape(-1, columns.shape[2])
+        hessian += flat[:, :-1].T @ flat[:, :-1]
+        gradient -= flat[:, :-1].T @ flat[:, -1]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    damped = hessian * scale[:, None] * scale + 1e-6 * np.eye(scale.size)
+    return -scale * np.linalg.solve(damped, scale * gradient), hessian
+
+
+def leashed(problem: Problem, leash: float) -> FloatArray:
+    """Return prior deviations with those of logarithmic parameters no longer than a leash."""
+    std = problem.network.parameters.prior_std.copy()
+    std[problem.logarithmic] = np.minimum(std[problem.logarithmic], leash)
+    return std
+
+
+def fit_with_latent_heat(
+    problem: Problem,
+    free: FloatArray | None = None,
+    *,
+    near: HeatFit | None = None,
+    n_passes: int = 12,
+    leashes: Sequence[float] = LEASHES,
+) -> HeatFit:
+    """Fit the free parameters in the presence of latent heat.
+
+    Parameters
+    ----------
+    problem
+        Network and telemetry; its parameters are the prior.
+    free : (n_free,)
+        Where to start; the problem's own parameters by default.
+    near
+        A fit of the same telemetry from which temperatures and latent heat start.
+    n_passes
+        Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
+    leashes
+        Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
+
+    Returns
+    -------
+    HeatFit
+    """
+    parameters = problem.network.parameters
+    free = parameters.free.copy() if free is None else free.copy()
+    values = parameters.to_values(free)
+    if near is not None:
+        nominals, latent = _carried_over(problem, values, near)
+        sizes = new_search(problem.n_nodes, 1.5)
+        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes)
+    first = tuple(
+        linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
+        for s in problem.segments
+    )
+    typical = first_size(problem, first)
+    started = []
+    for share in START_SHARES:
+        fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
+        sizes = new_search(problem.n_nodes, LARGEST_LOG_STEP)
+        for leash in leashes:
+            fit = _pass(fit, sizes, leash, smoothing=True)
+        started.append((fit, sizes))
+    fit, sizes = max(started, key=lambda item: item[0].log_posterior)
+    return _settle(fit, sizes, n_passes)
+
+
+def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int) -> HeatFit:
+    """Take passes until the likelihood no longer grows."""
+    for _ in range(n_passes):
+        before = fit.log_likelihood
+        fit = _pass(fit, sizes, np.inf)
+        if fit.log_likelihood - before < SETTLED_NATS and (sizes.log_step < SETTLED_LOG_STEP).all():
+            break
+    return fit
+
+
+def _pass(fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = False) -> HeatFit:
+    """Relinearise about smoothed temperatures where asked, then improve parameters, then the latent heat's size."""
+    problem, nominals = fit.problem, fit.nominals
+    if smoothing:
+        nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
+    free, latent, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
+    latent, value = sizes.improve(problem, latent, nominals)
+    return HeatFit(problem, free, latent, nominals, value)
+
+
+def with_capacities(problem: Problem, latent: LatentHeat, before: FloatArray, after: FloatArray) -> LatentHeat:
+    """Return the latent heat that makes the same rates of temperature at other parameter values.
+
+    Telemetry tells how fast temperatures move, not by how many watts. A size held in watts would make the likelihood of
+    a capacity depend on the size more than on the heat balance, which a Gauss-Newton step does not see.
+    """
+    index = problem.network.capacity_index
+    return replace(latent, std_W=latent.std_W * after[index] / before[index])
+
+
+def _improve(
+    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float
+) -> tuple[FloatArray, LatentHeat, tuple[Nominal, ...]]:
+    """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
+    parameters, std = problem.network.parameters, leashed(problem, leash)
+    now = parameters.to_values(free)
+
+    def posterior(at: FloatArray, size: LatentHeat, about: Sequence[Nominal]) -> float:
+        return log_likelihood(problem, size, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
+
+    before = posterior(free, latent, nominals)
+    step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
+    logarithmic = problem.logarithmic
+    step *= min(1.0, 1.5 / max(np.abs(step[logarithmic]).max(initial=0.0), 1e-12))
+    for _ in range(5):
+        trial = free + step
+        values = parameters.to_values(trial)
+        size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
+        if posterior(trial, size, about) > before:
+            return trial, size, about
+        step = 0.35 * step
+    return free, latent, tuple(nominals)
+
+
+def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], LatentHeat]:
+    """Linearise a network that may have more states about the temperatures and heat of a fit close by."""
+    network, before = problem.network, near.problem.network
+    like = {extra.name: extra.like for extra in network.extra}
+    source = [before.nodes.index(n if n in before.nodes else like[n]) for n in network.nodes]
+    own = np.array([n in before.nodes for n in network.nodes])
+    fresh = []
+    for nominal, segment in zip(near.nominals, problem.segments, strict=True):
+        states = states_of(nominal)[:, source]
+        fresh.append(linearise(problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0)))
+    std = np.where(own, near.latent.std_W[source], 1e-6)
+    return tuple(fresh), LatentHeat(std, near.latent.length_s)
