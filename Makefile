@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-fast check bench serve clean
+.PHONY: demo test test-fast check bench bench-paper-b serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -29,6 +29,9 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
+
+bench-paper-b: $(STAMP)
+	$(BIN)/python -m benchmarks.paper_b
 
 serve: $(STAMP)
 	$(BIN)/twin serve
