@@ -103,7 +103,7 @@ def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
 
     for width in (360, 820, 1400):
         page.resize(width, 900)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        page.until(f"document.documentElement.scrollWidth <= {width}")
     assert page.troubles == []
 
 
