@@ -1,0 +1,217 @@
+"""The closed loop on spacecraft that SciPy simulated: it finds what is missing, and nothing where nothing is."""
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.network_cases import Case, network_case
+from twin_core.discover import close_loop
+from twin_core.discover.loop import ClosedLoop
+from twin_core.effects import REGISTRY
+from twin_core.errors import Cancelled, TelemetryError
+from twin_core.network.spec import load_spec
+from twin_core.telemetry import Record
+
+CASES = {
+    "radiation_to_sink": 5,
+    "leak_to_boundary": 1,
+    "missing_conductor": 1,
+    "input_gain": 1,
+}
+"""Effect -> seed of a small spacecraft over five orbits, a sample every three minutes."""
+
+
+def small_case(effect: str | None, seed: int) -> Case:
+    return network_case(effect, seed, n_orbits=5, dt_s=180.0)
+
+
+@dataclass(frozen=True)
+class Run:
+    case: Case
+    loop: ClosedLoop
+    progress: tuple[float, ...]
+
+    @property
+    def report(self) -> dict[str, Any]:
+        return self.loop.report
+
+
+@cache
+def solved(effect: str | None) -> Run:
+    """Return the closed loop of a case, run once."""
+    case, heard = small_case(effect, CASES.get(effect or "", 1)), []
+    loop = close_loop(case.spec, [case.record], progress=lambda f, m: heard.append(f))
+    return Run(case, loop, tuple(heard))
+
+
+@pytest.fixture(params=list(CASES))
+def run(request: pytest.FixtureRequest) -> Run:
+    return solved(request.param)
+
+
+@pytest.fixture
+def healthy() -> Run:
+    return solved(None)
+
+
+def named(report: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Return what the report names or lists as indistinguishable."""
+    return [(row["effect"], row["where"]) for f in report["findings"] for row in (f, *f["alternatives"])]
+
+
+def test_the_missing_effect_is_found_in_its_place(run: Run) -> None:
+    assert run.report["verdict"] == "effect_added"
+    assert (run.case.effect, run.case.where) in named(run.report)
+    assert run.report["findings"][0]["effect"] == run.case.effect
+
+
+def test_the_held_out_error_falls_to_the_noise(run: Run) -> None:
+    before, after = run.report["before"]["rmse_K"], run.report["after"]["rmse_K"]
+    assert after < 0.8 * before
+    assert after < 1.5 * run.report["noise_floor_K"]
+    assert run.report["residual_whiteness"]["after"] < run.report["residual_whiteness"]["before"]
+
+
+def test_the_corrected_model_carries_the_effect(run: Run) -> None:
+    places = {effect.place for effect in run.loop.model.effects}
+    assert len(places) == len(run.report["findings"])
+    assert run.loop.before_model.effects == ()
+    assert run.loop.model.network().parameters.free_names == run.loop.model.free_names
+
+
+def check_score(score: dict[str, Any], sensors: tuple[str, ...]) -> None:
+    assert score["rmse_K"] >= 0.0 and -1.0 <= score["pcc"] <= 1.0
+    assert set(score["per_sensor"]) == set(sensors)
+    for row in score["per_sensor"].values():
+        assert {"rmse_K", "pcc", "bias_K"} <= set(row)
+        assert abs(row["bias_K"]) <= row["rmse_K"] + 1e-12
+
+
+def check_report(report: dict[str, Any], case: Case) -> None:
+    """Assert the shape of contract section 6."""
+    assert report["twin"] == case.spec.twin
+    assert report["verdict"] in ("effect_added", "no_effect_supported", "unexplained")
+    for part in ("train", "holdout"):
+        span = report[part]
+        assert span["start"] < span["stop"] and isinstance(span["samples"], int) and span["samples"] > 0
+    assert report["train"]["stop"] <= report["holdout"]["start"]
+    for part in ("before", "after"):
+        check_score(report[part], case.spec.sensors)
+    assert report["noise_floor_K"] > 0.0 and report["elapsed_s"] > 0.0
+    assert set(report["residual_whiteness"]) == {"before", "after"}
+    for finding in report["findings"]:
+        check_finding(finding)
+    factors = [f["evidence"]["log_bayes_factor"] for f in report["findings"]]
+    assert factors == sorted(factors, reverse=True)
+
+
+def check_finding(finding: dict[str, Any]) -> None:
+    kind = REGISTRY[finding["effect"]]
+    assert tuple(finding["where"]) == kind.keys
+    assert finding["parameters"] and finding["evidence"]["log_bayes_factor"] > 0.0
+    assert 0.0 <= finding["evidence"]["p_value"] <= 1.0
+    for row in finding["parameters"].values():
+        assert set(row) == {"mean", "std"}
+    for other in finding["alternatives"]:
+        assert tuple(other["where"]) == REGISTRY[other["effect"]].keys
+        assert other["log_bayes_factor"] >= finding["evidence"]["log_bayes_factor"] - 3.0 - 1e-9
+        assert (other["effect"], other["where"]) != (finding["effect"], finding["where"])
+
+
+def test_the_report_keeps_its_form(run: Run, healthy: Run) -> None:
+    for each in (run, healthy):
+        check_report(each.report, each.case)
+        assert json.loads(json.dumps(each.report, allow_nan=False)) == each.report
+
+
+def test_the_plots_are_plain_data(run: Run, healthy: Run) -> None:
+    for each in (run, healthy):
+        plots = json.loads(json.dumps(each.loop.plots, allow_nan=False))
+        assert len(plots["time"]) <= 2000
+        assert set(plots["sensors"]) == set(each.case.spec.sensors)
+        for curves in plots["sensors"].values():
+            assert len(curves["measured"]) == len(curves["before"]) == len(curves["after"]) == len(plots["time"])
+        assert plots["time"][0] <= plots["holdout_start"] <= plots["time"][-1]
+
+
+def test_nothing_is_found_where_nothing_is_missing(healthy: Run) -> None:
+    assert healthy.report["verdict"] == "no_effect_supported"
+    assert healthy.report["findings"] == []
+    assert healthy.report["before"] == healthy.report["after"]
+    assert healthy.loop.model is healthy.loop.before_model
+
+
+def test_the_hold_out_takes_no_part() -> None:
+    """Whatever comes after the cut, garbage or the truth: findings, evidence and both models are the same to the bit."""
+    truth = solved("leak_to_boundary")
+    case, record = truth.case, truth.case.record
+    cut = 0.7 * float(record.time_s[-1] - record.time_s[0]) + float(record.time_s[0])
+    late = np.flatnonzero(record.time_s > cut + 1e-6)
+    rng = np.random.default_rng(0)
+    garbage = {name: column.copy() for name, column in record.values.items()}
+    for name, column in garbage.items():
+        column[late] = rng.permutation(column[late]) * (1.0 if name in ("mode", "T_room") else 0.9)
+    spoilt = close_loop(case.spec, [Record(record.time_s, garbage, None, record.name)])
+    assert truth.report["findings"] and spoilt.report["findings"] == truth.report["findings"]
+    for key in ("verdict", "train", "not_supported", "training", "noise_floor_K"):
+        assert spoilt.report[key] == truth.report[key], key
+    assert spoilt.model.to_json() == truth.loop.model.to_json()
+    assert spoilt.before_model.to_json() == truth.loop.before_model.to_json()
+    assert spoilt.report["after"]["rmse_K"] > 2.0 * truth.report["after"]["rmse_K"]
+
+
+def tiny() -> Case:
+    """Return three coarse orbits of a healthy spacecraft: enough to run."""
+    return network_case(None, 1, n_orbits=3, dt_s=300.0)
+
+
+def test_separate_hold_out_files_with_a_burn_in() -> None:
+    case = tiny()
+    position = np.arange(case.record.time_s.size)
+    first, second = case.record.take(position < 35), case.record.take(position >= 35)
+    loop = close_loop(case.spec, [first], holdout_records=[second], burn_in_s=1800.0)
+    check_report(loop.report, case)
+    assert loop.report["train"]["samples"] == 35
+    assert loop.report["holdout"]["start"] == second.time_s[0] + 1800.0
+    assert loop.report["holdout"]["samples"] == second.time_s.size - 1 - 6
+
+
+def test_excluded_intervals_of_the_hold_out_are_not_scored() -> None:
+    case = tiny()
+    stop = float(case.record.time_s[-1]) + 1.0
+    data = case.spec.model_dump(mode="json", exclude_none=True)
+    spec = load_spec(data | {"exclude": [{"start": stop - 1500.0, "stop": stop, "reason": "safe mode"}]})
+    report = close_loop(spec, [case.record]).report
+    late = int((case.record.time_s > report["train"]["stop"]).sum())
+    assert report["holdout"]["samples"] == late - 5
+    assert report["holdout"]["stop"] == case.record.time_s[-1]
+
+
+def test_progress_runs_from_start_to_end(run: Run) -> None:
+    assert list(run.progress) == sorted(run.progress)
+    assert 0.0 <= run.progress[0] < 0.1 and run.progress[-1] == 1.0
+
+
+def test_a_loop_can_be_cancelled() -> None:
+    def stop(fraction: float, message: str) -> None:
+        if fraction > 0.2:
+            raise Cancelled("stopped")
+
+    with pytest.raises(Cancelled):
+        close_loop(tiny().spec, [tiny().record], progress=stop)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1.0, -1.0, 2.0, np.nan])
+def test_an_impossible_false_alarm_rate_is_refused(rate: float) -> None:
+    case = tiny()
+    with pytest.raises(TelemetryError, match="false_alarm_rate: must be between 0 and 1"):
+        close_loop(case.spec, [case.record], false_alarm_rate=rate)
+
+
+def test_no_telemetry_is_refused() -> None:
+    with pytest.raises(TelemetryError, match="no telemetry given"):
+        close_loop(tiny().spec, [])
