@@ -25,10 +25,12 @@ from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
 
-MAX_WORK = 6e6
+MAX_WORK = 2e6
 """Steps times squared states that are smoothed at most: beyond, the witness takes the end of the record alone."""
 MAX_LINEARISATIONS = 3
 MAX_DEGREE = 4
+MAX_TERMS_WORK = 1e7
+"""Steps times squared states times polynomial terms beyond which heat over temperature is left to the plotted points."""
 SMALLEST_SHARE = 0.02
 """Size of the latent force on a node of interest at least, as a share of the heat that passes through the node. What the
 calibration sized to nothing elsewhere carries no force at all."""
@@ -149,13 +151,17 @@ def bear_witness(search: Search) -> Witness:
         force, model, observations, values, view = _smoothed(search.base.fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError) as error:
         return Witness((), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",))
-    laws, notices = _laws(model, observations, values, force)
+    watched = [force.nodes.index(search.base.fit.network.nodes.index(node)) for node in nodes]
+    laws, notices = _laws(model, observations, values, force, watched)
+    if view.first_step > 0:
+        notices.append(
+            f"missing heat: smoothed over the last {np.ptp(force.time_s):.0f} s of the training record alone"
+        )
     states = force.temperature_K[1:]
     effect, turnover = effect_heat(search, states, view.first_step), view.turnover_W(search.base.fit.network, states)
     heats = []
-    for node in nodes:
-        at = search.base.fit.network.nodes.index(node)
-        k = force.nodes.index(at)
+    for node, k in zip(nodes, watched, strict=True):
+        at = force.nodes[k]
         mean, std = force.mean_W[1:, k], force.std_W[1:, k]
         if not (np.isfinite(mean).all() and np.isfinite(std).all()):
             notices.append(f"missing heat at {node}: the latent force is not finite")
@@ -259,16 +265,19 @@ def _readings(network: Network, nominal: Nominal) -> FloatArray:
 
 
 def _laws(
-    model: ForceModel, observations: FloatArray, values: FloatArray, force: LatentForce
+    model: ForceModel, observations: FloatArray, values: FloatArray, force: LatentForce, watched: Sequence[int]
 ) -> tuple[dict[int, ForcePolynomial], list[str]]:
     """Return node -> polynomial of its temperature, where the evidence supports that the heat repeats with it."""
+    n_states = model.n_nodes + len(model.forces)
+    if force.time_s.size * n_states**2 * (MAX_DEGREE + 1) * len(watched) > MAX_TERMS_WORK:
+        return {}, []
     try:
-        learned = learn_heat_flow(model, observations, values, force, max_degree=MAX_DEGREE)
+        learned = learn_heat_flow(model, observations, values, force, max_degree=MAX_DEGREE, only=watched)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError) as error:
         return {}, [f"missing heat over temperature: no regression ({error})"]
     if not learned.log_bayes_factor > 0.0:
         return {}, []
-    return dict(zip(force.nodes, learned.polynomials, strict=True)), []
+    return {force.nodes[k]: law for k, law in zip(watched, learned.polynomials, strict=True)}, []
 
 
 def _rms(values: FloatArray) -> float:

@@ -203,7 +203,8 @@ def regress_pointwise(
 ) -> ForcePolynomial:
     """Regress as the paper does: every smoothed force an independent sample with the average variance (eqs. 33-38).
 
-    Its weights are good, its band is far too narrow, since neighbouring smoothed forces repeat each other; use
+    The mean of its weights is good, their covariance far too small, since neighbouring smoothed forces repeat each other;
+    the average variance, added to every prediction, makes the band wide whatever the record. Use
     :func:`twin_core.latent_force.regression.learn_heat_flow` where the band matters.
 
     Parameters

@@ -1,11 +1,12 @@
 """The heat as a polynomial of temperature, learned from the samples themselves under the model's full covariance.
 
-Smoothed forces are strongly correlated in time, so fitting a curve through them as if they were independent gives a band
-that is far too narrow. Here the weights enter the heat balance: y = network + sum_j w_j (response to term j along the
+Smoothed forces are strongly correlated in time, so fitting a curve through them as if they were independent gives weights
+that are far too certain. Here the weights enter the heat balance: y = network + sum_j w_j (response to term j along the
 smoothed temperatures) + latent force as the misfit + noise. One filter whitens samples and responses together, so that
 every degree, and every combination of degrees over the forces, is a small ridge regression with an exact evidence.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -16,7 +17,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
 from twin_core.gp.columns import WhiteRegression, whiten_responses
 from twin_core.gp.discretise import discretise
-from twin_core.latent_force.model import ForceModel, augment, drive, step_table
+from twin_core.latent_force.model import Force, ForceModel, augment, drive, step_table
 from twin_core.latent_force.polynomial import Basis, ForcePolynomial
 from twin_core.latent_force.smooth import LatentForce
 
@@ -35,7 +36,7 @@ class LearnedHeatFlow:
     Attributes
     ----------
     polynomials
-        One per force.
+        One per force that was learned.
     degrees
         Theirs.
     misfit_W : (n_forces,)
@@ -78,8 +79,9 @@ def learn_heat_flow(
     degree: int | None = None,
     boundary_K: FloatArray | None = None,
     vanishing: bool | None = None,
+    only: Sequence[int] | None = None,
 ) -> LearnedHeatFlow:
-    """Learn each force as a polynomial of its node's temperature.
+    """Learn each force, or some of them, as a polynomial of its node's temperature.
 
     Parameters
     ----------
@@ -100,25 +102,31 @@ def learn_heat_flow(
     vanishing
         Whether the heat is a polynomial of the difference to the boundary that vanishes with it. By default the
         evidence decides where a boundary is given.
+    only
+        Positions of the forces to be learned, in the order of the result; the others stay as they are. All by default.
 
     Raises
     ------
     ModelError
-        The model has no force, or a shape does not fit.
+        The model has no force, a learned one shares hyperparameters with one that stays, or a shape does not fit.
     """
-    if not model.forces:
+    picked = tuple(range(len(model.forces))) if only is None else tuple(only)
+    if not picked:
         raise ModelError("the model has no latent force to learn a heat flow from")
+    _refuse_shared(model, picked)
     forms = [vanishing] if vanishing is not None else [False] if boundary_K is None else [False, True]
     learned = [
-        _learn(model, observations, values, smoothed, _Range(max_degree, degree, boundary_K, form)) for form in forms
+        _learn(model, observations, values, smoothed, _Range(picked, max_degree, degree, boundary_K, form))
+        for form in forms
     ]
     return max(learned, key=lambda found: found.log_evidence)
 
 
 @dataclass(frozen=True)
 class _Range:
-    """What may be learned: degrees, second variable, form."""
+    """What may be learned: which forces (their positions), degrees, second variable, form."""
 
+    picked: tuple[int, ...]
     max_degree: int
     degree: int | None
     boundary_K: FloatArray | None
@@ -135,19 +143,23 @@ def _learn(
     model: ForceModel, observations: FloatArray, values: FloatArray, smoothed: LatentForce, allowed: _Range
 ) -> LearnedHeatFlow:
     """Learn within one form of basis: misfit and degrees by evidence."""
+    forces = [model.forces[k] for k in allowed.picked]
     bases = [
         Basis.over(
             allowed.degrees[-1], smoothed.temperature_K[:, f.node], allowed.boundary_K, vanishing=allowed.vanishing
         )
-        for f in model.forces
+        for f in forces
     ]
-    prior_std_W = np.maximum(_scales(model, values), np.sqrt(np.mean(smoothed.mean_W**2, axis=0)))
-    offsets = _responses(model, values, smoothed, bases, allowed.boundary_K)
+    scales = _scales(model, values)[list(allowed.picked)]
+    prior_std_W = np.maximum(scales, np.sqrt(np.mean(smoothed.mean_W[:, list(allowed.picked)] ** 2, axis=0)))
+    offsets = _responses(model, values, smoothed, forces, bases, allowed.boundary_K)
     problems = []
     for share in MISFIT_SHARES:
-        white = whiten_responses(model.linear_model(_shrink(model, values, share)), observations, offsets)
+        white = whiten_responses(
+            model.linear_model(_shrink(model, values, share, allowed.picked)), observations, offsets
+        )
         problems.append(_Problem.of(white, bases, prior_std_W))
-    family = _Family(tuple(problems), np.outer(MISFIT_SHARES, _scales(model, values)))
+    family = _Family(tuple(problems), np.outer(MISFIT_SHARES, scales))
     degrees = family.choose(allowed.degrees)
     choice = family.solve(degrees)
     return LearnedHeatFlow(
@@ -166,10 +178,19 @@ def _scales(model: ForceModel, values: FloatArray) -> FloatArray:
     return np.array([np.sqrt(np.real(b.observation @ b.stationary_cov @ b.observation)) for b in blocks])
 
 
-def _shrink(model: ForceModel, values: FloatArray, share: float) -> FloatArray:
-    """Return the parameters with every standard deviation of a force scaled."""
+def _refuse_shared(model: ForceModel, picked: tuple[int, ...]) -> None:
+    """Refuse to learn a force whose size is also that of one that stays."""
+    learned = {i for k in picked for i in model.forces[k].index}
+    for k, force in enumerate(model.forces):
+        if k not in picked and learned & set(force.index):
+            raise ModelError(f"force on node {force.node} stays but shares hyperparameters with one that is learned")
+
+
+def _shrink(model: ForceModel, values: FloatArray, share: float, picked: tuple[int, ...]) -> FloatArray:
+    """Return the parameters with every standard deviation of the picked forces scaled."""
     shrunk = np.array(values, dtype=np.float64)
-    scaled = {i for f in model.forces for i, name in zip(f.index, f.kernel.names, strict=True) if name[:3] == "std"}
+    forces = [model.forces[k] for k in picked]
+    scaled = {i for f in forces for i, name in zip(f.index, f.kernel.names, strict=True) if name[:3] == "std"}
     shrunk[sorted(scaled)] *= share
     return shrunk
 
@@ -178,7 +199,8 @@ def _responses(
     model: ForceModel,
     values: FloatArray,
     smoothed: LatentForce,
-    bases: list[Basis],
+    forces: Sequence[Force],
+    bases: Sequence[Basis],
     boundary_K: FloatArray | None,
 ) -> FloatArray:
     """Return what a weight of one adds to the offset, (n_columns, n_steps, n_states): heat over capacity into the node."""
@@ -189,7 +211,7 @@ def _responses(
     discrete = discretise(np.real(feedback), np.real(diffusion), steps)
     capacity = np.broadcast_to(network.capacity_J_per_K, (index.size, model.n_nodes))
     columns = []
-    for force, basis in zip(model.forces, bases, strict=True):
+    for force, basis in zip(forces, bases, strict=True):
         node = force.node
         terms = basis.terms(smoothed.temperature_K[:, node], boundary_K, smoothed.temperature_std_K[:, node])
         into = slice(node, node + 1)

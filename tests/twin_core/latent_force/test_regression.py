@@ -78,7 +78,7 @@ def test_evidence_by_a_second_route(monkeypatch):
     monkeypatch.setattr(regression, "MISFIT_SHARES", (0.1,))
     found = learn_heat_flow(model, y, VALUES, smoothed, degree=2)
     bases = [regression.Basis.over(2, smoothed.temperature_K[:, node]) for node in (0, 1)]
-    offsets = regression._responses(model, VALUES, smoothed, bases, None)
+    offsets = regression._responses(model, VALUES, smoothed, model.forces, bases, None)
     base = model.linear_model(np.array([0.4, 200.0]))
     n, extra = base.n_states, offsets.shape[0]
     transition = np.zeros((TIMES.size - 1, n + extra, n + extra))
@@ -183,3 +183,30 @@ def test_a_model_without_force_is_told():
     y = _samples(0)
     with pytest.raises(ModelError, match="no latent force"):
         learn_heat_flow(bare, y, np.zeros(0), smooth_force(bare, y, np.zeros(0)))
+
+
+def test_one_force_is_learned_while_the_other_stays():
+    """Alone, with the other force as free as before, the curve is the same within its band, and in its own place."""
+    shared, y = _model(), _samples(4)
+    model = ForceModel.build(
+        shared.network(np.zeros(0)),
+        (0, 1),
+        shared.forces[0].kernel,
+        observation=shared.observation,
+        noise_std_K=shared.noise_std_K,
+        prior_mean_K=shared.prior_mean_K,
+        prior_std_K=shared.prior_std_K,
+        shared=False,
+    )
+    values = np.tile(VALUES, 2)
+    smoothed = smooth_force(model, y, values)
+    (both, alone) = (learn_heat_flow(model, y, values, smoothed, degree=2, only=only) for only in (None, [1]))
+    assert len(alone.polynomials) == 1 and alone.misfit_W.shape == (1,)
+    at = TRUTH[:, 1]
+    together, single = both.polynomials[1].predict(at), alone.polynomials[0].predict(at)
+    assert (np.abs(together.mean_W - single.mean_W) < 2.0 * single.std_W).all()
+    swapped = learn_heat_flow(model, y, values, smoothed, degree=2, only=[1, 0])
+    assert swapped.log_evidence == pytest.approx(both.log_evidence, abs=1e-6)
+    np.testing.assert_allclose(swapped.polynomials[0].mean_W, both.polynomials[1].mean_W, rtol=1e-6, atol=1e-8)
+    with pytest.raises(ModelError, match="shares hyperparameters"):
+        learn_heat_flow(shared, y, VALUES, smoothed, only=[1])
