@@ -9,6 +9,7 @@ from fastapi import FastAPI
 from service import problems
 from service.access import Gate
 from service.bodies import Bodies
+from service.core_workbench import CoreWorkbench
 from service.deps import Service
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
@@ -21,7 +22,7 @@ from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
 from service.streams import Hub
-from service.workbench import CoreWorkbench, Workbench
+from service.workbench import Workbench
 
 log = logging.getLogger("service")
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 import uvicorn
 
 from service.app import create_app
+from service.core_workbench import CoreWorkbench
 from service.patience import patient
 from service.settings import Settings
 from service.store.database import Database
-from service.workbench import CoreWorkbench, Workbench
+from service.workbench import Workbench
 from twin_core.errors import TwinError
 
 SHUTDOWN_S = 10

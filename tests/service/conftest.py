@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from service.app import create_app
+from service.core_workbench import CoreWorkbench
 from service.settings import read_settings
-from service.workbench import CoreWorkbench
 from tests.service.harness import AppClient
 
 SPEC: dict[str, Any] = {

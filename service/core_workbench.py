@@ -1,0 +1,181 @@
+"""The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import orjson
+from numpy.typing import NDArray
+
+from service.workbench import (
+    CalibrationTask,
+    DiagnosisTask,
+    Filtered,
+    Forecasted,
+    ForecastTask,
+    Json,
+    Outcome,
+    Progress,
+    Telemetry,
+)
+
+
+class CoreWorkbench:
+    """The workbench of ``twin_core``."""
+
+    def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
+        """Fit the declared network."""
+        from twin_core.calibrate import calibrate
+
+        spec = _spec(task.specification)
+        train, recent = task.telemetry.before(task.validation_us), task.telemetry.since(task.validation_us)
+        model = calibrate(
+            spec,
+            [_record(spec, train)],
+            method=task.method,
+            progress=lambda fraction, message: progress(0.9 * fraction, message),
+        )
+        progress(0.92, "scoring on recent data")
+        held = _held_out(spec, train, recent)
+        rmse_K = _rmse_K(model, held)
+        rival = None if task.rival is None or held is None else _rmse_K(_model_of(task.rival), held)
+        validation = {
+            "rmse_K": rmse_K if rmse_K is not None else model.summary.get("rmse_K"),
+            "on": "recent data held back" if rmse_K is not None else "the training data: too few to hold any back",
+            "samples": int(recent.time_us.size),
+        }
+        return _outcome(model, validation, rival)
+
+    def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
+        """Close the loop."""
+        from twin_core.discover import close_loop
+        from twin_core.discover.html import render
+
+        spec = _spec(task.specification)
+        loop = close_loop(
+            spec,
+            [_record(spec, task.telemetry)],
+            holdout=task.holdout,
+            burn_in_s=task.burn_in_s,
+            false_alarm_rate=task.false_alarm_rate,
+            progress=progress,
+        )
+        before, after = loop.report["before"]["rmse_K"], loop.report["after"]["rmse_K"]
+        validation = {"rmse_K": after, "before_rmse_K": before, "on": "the hold-out of the diagnosis"}
+        outcome = _outcome(loop.model, validation, None)
+        return Outcome(
+            outcome.document,
+            loop.report["train"],
+            validation,
+            outcome.effects,
+            report=loop.report,
+            page=render(loop.report, loop.plots),
+            extra=outcome.extra,
+        )
+
+    def inspect(self, document: Json) -> Outcome:
+        """Check a model that was made elsewhere."""
+        model = _model_of(document)
+        return _outcome(model, {"rmse_K": model.summary.get("rmse_K"), "on": "its own training data"}, None)
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        """Filter a stretch of telemetry."""
+        from twin_core.assimilate import assimilate
+
+        model = _cached_model(document)
+        done = assimilate(model, _record(model.spec, telemetry), state)
+        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
+
+    def forecast(self, document: str, task: ForecastTask) -> Forecasted:
+        """Look ahead."""
+        from twin_core.forecast import forecast
+        from twin_core.units import from_si
+
+        model = _cached_model(document)
+        spec = model.spec
+        ahead = forecast(
+            model,
+            _record(spec, task.telemetry),
+            task.horizon_s,
+            step_s=task.step_s,
+            plan=None if task.plan is None else _record(spec, task.plan),
+            quantiles=task.quantiles,
+            state=task.state,
+        )
+
+        def columns(values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+            return {name: from_si(values[:, i], spec.channels[name].unit) for i, name in enumerate(ahead.sensors)}
+
+        time_us = task.telemetry.epoch_us + np.rint(ahead.time_s * 1e6).astype(np.int64)
+        quantiles = {q: columns(values) for q, values in ahead.quantiles_K.items()}
+        return Forecasted(time_us, columns(ahead.mean_K), quantiles)
+
+    def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
+        """Return temperatures and heat flows of the moment that the state describes."""
+        from twin_core.flows import heat_flows
+
+        model = _cached_model(document)
+        return heat_flows(model, _record(model.spec, telemetry), state)
+
+
+def _spec(specification: Json) -> Any:
+    from twin_core.network.spec import load_spec
+
+    return load_spec(specification)
+
+
+def _record(spec: Any, telemetry: Telemetry) -> Any:
+    """Return the telemetry as a record in SI on the model's time axis."""
+    from twin_core.telemetry import Record
+    from twin_core.units import to_si
+
+    time_s = (telemetry.time_us - telemetry.epoch_us) / 1e6
+    values = {name: to_si(column, spec.channels[name].unit) for name, column in telemetry.values.items()}
+    return Record(time_s, values, telemetry.epoch_us * 1000, "archive")
+
+
+def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> Any:
+    """Return the recent data as a hold-out that follows on the training data, or None if there is too little."""
+    from twin_core.discover.holdout import HeldOut
+
+    if recent.time_us.size < 3:
+        return None
+    last = train.since(int(train.time_us[-1]))
+    values = {name: np.concatenate([last.values[name], column]) for name, column in recent.values.items()}
+    scored = Telemetry(recent.epoch_us, np.concatenate([last.time_us, recent.time_us]), values)
+    return HeldOut(_record(spec, train), _record(spec, scored))
+
+
+def _rmse_K(model: Any, held: Any) -> float | None:
+    """Return the open-loop error of a model on the hold-out, over every reading."""
+    from twin_core.discover.holdout import predict
+
+    if held is None:
+        return None
+    prediction = predict(model, held)
+    squares = (prediction.measured_K - prediction.predicted_K) ** 2
+    return float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None
+
+
+def _model_of(document: Json) -> Any:
+    from twin_core.calibrate import CalibratedModel
+
+    return CalibratedModel.from_json(document)
+
+
+@lru_cache(maxsize=8)
+def _cached_model(document: str) -> Any:
+    return _model_of(orjson.loads(document))
+
+
+def _outcome(model: Any, validation: Json, rival_rmse_K: float | None) -> Outcome:
+    document = model.to_json()
+    summary = dict(model.summary)
+    train = summary.pop("train", {})
+    extra = {"parameters": summary.get("parameters", []), "notices": summary.get("notices", []), "fit": summary}
+    return Outcome(document, train, validation, [_wire(e) for e in document["effects"]], rival_rmse_K, extra=extra)
+
+
+def _wire(effect: Json) -> Json:
+    """Return an effect of a model file as clients see it."""
+    return {"effect": effect["effect"], "where": effect["where"], "parameters": effect["values"]}
