@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
+from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.gp.kernels import Matern
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import grid_times_s, linearise_network, on_grid
@@ -101,3 +102,28 @@ def test_hidden_heat_is_found(max_step_s):
     wrong = (found.mean_W[:, 0] - _hidden(found.time_s))[forcing.sample_step]
     assert np.sqrt(np.mean(wrong[3:-3] ** 2)) < 0.3
     assert np.mean(np.abs(wrong) < 1.96 * found.std_W[forcing.sample_step, 0]) > 0.85
+
+
+def test_a_registered_effect_is_part_of_the_network():
+    """A wrong leak of 0.05 W/K carried by the network: the force supplies the hidden heat and gives the leak's back."""
+    plain, forcing = _forcing(60.0)
+    leak = LeakToBoundary({"node": "b", "boundary": "space"}, {"G_W_per_K": 0.05})
+    network = build_network(plain.spec, [leak])
+    about = linearise_network(network, forcing)
+    temperatures = np.stack([np.interp(grid_times_s(forcing), TIMES, column) for column in TRUTH.T], axis=1)
+    with_leak, without = about(temperatures), linearise_network(plain, forcing)(temperatures)
+    np.testing.assert_allclose((with_leak.jacobian_per_s - without.jacobian_per_s)[:, 1, 1], -0.05 / 2000.0, rtol=1e-9)
+    samples = TRUTH + 0.01 * np.random.default_rng(1).normal(size=TRUTH.shape)
+    model = ForceModel.build(
+        about(np.full((forcing.n_steps + 1, 2), 260.0)),
+        (1,),
+        Matern(5),
+        observation=np.eye(2),
+        noise_std_K=[0.01, 0.01],
+        prior_mean_K=TRUTH[0],
+        prior_std_K=1.0,
+    )
+    found = smooth_extended(model, about, on_grid(forcing, samples), np.array([10.0, 1000.0]))
+    expected = _hidden(TIMES) - 0.05 * (3.0 - TRUTH[:, 1])
+    wrong = found.mean_W[forcing.sample_step, 0] - expected
+    assert found.converged and np.sqrt(np.mean(wrong[3:-3] ** 2)) < 0.4
