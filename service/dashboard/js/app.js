@@ -174,7 +174,7 @@ function renderResiduals(list) {
     return;
   }
   const { start, stop } = window_s();
-  const anomalies = state.anomalies.map((a) => ({ sensor: a.sensor, start: seconds(a.start), stop: a.stop && seconds(a.stop) }));
+  const anomalies = state.anomalies.filter((a) => a.model_version === found.model_version[0]).map((a) => ({ sensor: a.sensor, start: seconds(a.start), stop: a.stop && seconds(a.stop) }));
   const end = state.ahead ? seconds(state.ahead.time.at(-1)) : stop;
   residuals.update({ range: [start, end], kind: state.kind, sensors: list, time: found.time.map(seconds), values: found.residual_K, nis: found.nis, anomalies });
   $("residual-note").textContent = `measured minus predicted one step ahead, model v${found.model_version[0]}`;

@@ -55,7 +55,7 @@ function spread(places) {
   for (let round = 0; round < 120; round++) {
     for (const a of spots) for (const b of spots) {
       if (a === b) continue;
-      const dx = a[0] - b[0] || 0.1, dy = (a[1] - b[1] || 0.1) * 1.15, gap = Math.hypot(dx, dy);
+      const dx = a[0] - b[0] || 0.1, dy = (a[1] - b[1] || 0.1) * 0.85, gap = Math.hypot(dx, dy);
       if (gap >= APART) continue;
       const push = (APART - gap) / gap / 4;
       a[0] = inside(a[0] + dx * push, WIDTH);
@@ -130,13 +130,14 @@ export class NetworkDrawing {
     const ends = effect.where.nodes || [effect.where.node, effect.where.sink || effect.where.boundary];
     const total = Object.values(effect.heat_W)[0];
     const label = `${effectWords({ effect: effect.effect, where: {} })}${total === undefined ? "" : ` ${watts(total)}`}`;
-    const [a, b] = ends.map((end) => this.places.get(end));
+    const heated = Object.keys(effect.heat_W).find((node) => this.places.has(node));
+    const [a, b] = [this.places.get(ends[0] || heated), this.places.get(ends[1])];
     if (a && b) {
       const { path, middle } = curve(a, b, -30);
       return [draw("path", { d: path, class: "effect" }), draw("text", { x: middle[0], y: middle[1] - 6, class: "effect-label halo" }, label)];
     }
     if (!a) return [];
-    return [draw("circle", { cx: a[0], cy: a[1], r: 33, class: "effect" }), draw("text", { x: a[0], y: a[1] - 40, class: "effect-label halo" }, label)];
+    return [draw("circle", { cx: a[0], cy: a[1], r: 33, class: "effect" }), draw("text", { x: a[0], y: a[1] - 48, class: "effect-label halo" }, label)];
   }
 
   sink({ id, temperature_K }, unit) {

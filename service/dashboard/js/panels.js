@@ -25,7 +25,7 @@ export function drawAnomalies(list, anomalies, sensors, onPick) {
   list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
     const index = sensors.findIndex((s) => s.name === anomaly.sensor);
     const open = anomaly.stop === null, start = seconds(anomaly.start);
-    const cause = anomaly.cause ? effectWords(anomaly.cause) : open ? "cause unknown yet" : "cause not traced";
+    const cause = anomaly.cause ? effectWords(anomaly.cause) : open ? "cause unknown yet" : `seen by model v${anomaly.model_version}`;
     const length = open ? "lasts" : `for ${span(Math.max(1, seconds(anomaly.stop) - start))}`;
     return make("li", {}, make("button", { class: "item", onclick: () => onPick(anomaly), "aria-label": `Show anomaly of ${anomaly.sensor}` },
       make("div", { class: "row" },
