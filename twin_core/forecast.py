@@ -187,7 +187,7 @@ def _variance(
     covariance[:n_free, :n_free] = model.covariance
     covariance[n_free:, n_free:] = state_covariance
     blocks = [
-        np.einsum("kap,pq,kaq->ka", block, covariance, block, optimize=True)
+        ((block @ covariance) * block).sum(axis=-1)
         for _, block in sensitivities(
             network, network.parameters.values, forcing, path, starts, n_free, network.sensor_node
         )
