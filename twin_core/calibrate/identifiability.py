@@ -48,6 +48,8 @@ def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str |
     weights = directions[:, -1]
     strongest = np.argsort(-np.abs(weights))[:3]
     names = [parameters.free_names[logarithmic[k]] for k in strongest if abs(weights[k]) > 0.2]
+    if len(names) < 2:  # one parameter that the data do not tell is said elsewhere
+        return None
     factor = float(np.exp(min(np.sqrt(spread[-1]), 20.0)))
     return f"the data tell {' and '.join(names)} only together: they may move by a factor {factor:.3g} as one"
 

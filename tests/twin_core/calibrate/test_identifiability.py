@@ -25,6 +25,7 @@ def test_a_ratio_that_alone_is_told_is_said() -> None:
     said = weakest_direction(SET, covariance)
     assert said is not None and "C:a" in said and "G" in said and "Q" not in said
     assert weakest_direction(SET, 1e-4 * np.eye(3)) is None
+    assert weakest_direction(SET, np.diag([4.0, 1e-4, 1e-4])) is None  # one alone is no combination
 
 
 def test_words_are_silent_where_all_is_seen() -> None:
