@@ -73,7 +73,7 @@ def bodies(count: int, frames: int, lane: int) -> list[bytes]:
     generator = np.random.default_rng(lane)
     made = []
     for number in range(count):
-        start = lane * 10_000_000 + number * frames
+        start = lane * 100_000 + number * frames
         time_s = [start + k for k in range(frames)]
         values = {f"T_{c}": np.round(290 + generator.normal(size=frames), 3).tolist() for c in range(CHANNELS)}
         made.append(json.dumps({"time": time_s, "values": values}).encode())
