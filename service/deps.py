@@ -1,4 +1,7 @@
-"""What routes are handed: the running service, the twin that a path names, and proof of the caller's role."""
+"""What routes are handed: the running service, the twin that a path names, and proof of the caller's role.
+
+All of them are coroutines, although none waits: a plain function would be run in a thread, once per request each.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -48,7 +51,7 @@ class Service:
         self.hub.close(twin.key)
 
 
-def running_service(connection: HTTPConnection) -> Service:
+async def running_service(connection: HTTPConnection) -> Service:
     """Return the service behind a request or web socket."""
     service: Service = connection.app.state.service
     return service
@@ -64,7 +67,7 @@ class Needs:
         """Remember the least role."""
         self._role = role
 
-    def __call__(self, connection: HTTPConnection) -> None:
+    async def __call__(self, connection: HTTPConnection) -> None:
         """Check the role that the gate found."""
         if connection.scope["state"]["role"] < self._role:
             raise Problem(403, f"this needs a key of role '{self._role.name}'")
@@ -75,7 +78,7 @@ ingests = Depends(Needs(Role.ingest))
 operates = Depends(Needs(Role.operate))
 
 
-def named_twin(service: Running, twin: Annotated[str, Path(description="Id of a registered twin.")]) -> Entry:
+async def named_twin(service: Running, twin: Annotated[str, Path(description="Id of a registered twin.")]) -> Entry:
     """Return the twin that the path names (404 if there is none)."""
     return service.registry.get(twin)
 
