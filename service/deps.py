@@ -60,6 +60,12 @@ async def running_service(connection: HTTPConnection) -> Service:
 Running = Annotated[Service, Depends(running_service)]
 
 
+def require(connection: HTTPConnection, role: Role) -> None:
+    """Refuse callers below a role (403)."""
+    if connection.scope["state"]["role"] < role:
+        raise Problem(403, f"this needs a key of role '{role.name}'")
+
+
 class Needs:
     """A dependency that refuses callers below a role (403)."""
 
@@ -69,16 +75,17 @@ class Needs:
 
     async def __call__(self, connection: HTTPConnection) -> None:
         """Check the role that the gate found."""
-        if connection.scope["state"]["role"] < self._role:
-            raise Problem(403, f"this needs a key of role '{self._role.name}'")
+        require(connection, self._role)
 
 
 reads = Depends(Needs(Role.read))
-ingests = Depends(Needs(Role.ingest))
 operates = Depends(Needs(Role.operate))
 
 
-async def named_twin(service: Running, twin: Annotated[str, Path(description="Id of a registered twin.")]) -> Entry:
+TwinName = Annotated[str, Path(description="Id of a registered twin.")]
+
+
+async def named_twin(service: Running, twin: TwinName) -> Entry:
     """Return the twin that the path names (404 if there is none)."""
     return service.registry.get(twin)
 

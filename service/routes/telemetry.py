@@ -9,10 +9,11 @@ import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Request, Response
 
-from service.deps import NamedTwin, Running, Service, ingests, reads
+from service.access import Role
+from service.deps import NamedTwin, Running, Service, TwinName, reads, require
 from service.downsample import extremes
 from service.frames import Batch, parse_columns, parse_frames
-from service.instants import format_instant, format_instants, parse_parameter
+from service.instants import Instants, format_instant, format_instants, parse_parameter
 from service.messages import SampleStretch
 from service.problems import BadField, Problem
 from service.registry import Entry
@@ -36,31 +37,38 @@ _BODY = {
 }
 
 
-@router.post("", dependencies=[ingests], response_model=IngestReport, openapi_extra=_BODY)
-async def ingest(request: Request, service: Running, twin: NamedTwin) -> Response:
+@router.post("", response_model=IngestReport, openapi_extra=_BODY)
+async def ingest(request: Request, twin: TwinName) -> Response:
     """Store samples durably, then answer what became of each; a malformed body is refused whole."""
+    require(request, Role.ingest)  # by hand, as everything here: resolving dependencies costs as much as the parsing
+    service: Service = request.app.state.service
+    entry = service.registry.get(twin)
     body = await request.body()
     parse = _parser(request.headers.get("content-type", ""))
     if len(body) > PARSE_APART_BYTES:
-        batch = await asyncio.to_thread(parse, body, twin.channels)
+        batch = await asyncio.to_thread(parse, body, entry.channels)
     else:
-        batch = parse(body, twin.channels)
+        batch = parse(body, entry.channels)
     try:
-        receipt = await service.hub.write(twin.key, _store, twin, batch)
+        receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
     except LookupError:
-        raise Problem(404, f"no twin '{twin.name}' is registered") from None
-    if receipt.stored.any():
-        service.live.arrived(twin, batch.time_us[receipt.stored])
-    _count(service, twin, batch, receipt)
-    return Response(orjson.dumps(_report(receipt, batch)), media_type="application/json")
+        raise Problem(404, f"no twin '{twin}' is registered") from None
+    if accepted.size:
+        service.live.arrived(entry, accepted)
+    report = _report(receipt, int(accepted.size))
+    _count(service, twin, report)
+    return Response(orjson.dumps(report), media_type="application/json")
 
 
-def _store(connection: sqlite3.Connection, twin: Entry, batch: Batch) -> tuple[Receipt, Sequence[SampleStretch]]:
-    """Store a batch and say what the stream hears of it."""
+def _store(
+    connection: sqlite3.Connection, twin: Entry, batch: Batch
+) -> tuple[tuple[Receipt, Instants], Sequence[SampleStretch]]:
+    """Store a batch; return what became of it with the instants that were stored, and what the stream hears."""
     receipt = samples.append(connection, twin.key, batch)
     kept = receipt.stored
-    seqs = receipt.first_seq + np.arange(int(kept.sum()))
-    return receipt, [SampleStretch(twin.channels, seqs, batch.time_us[kept], batch.values[:, kept])]
+    time_us, values = (batch.time_us, batch.values) if kept.all() else (batch.time_us[kept], batch.values[:, kept])
+    seqs = np.arange(receipt.first_seq, receipt.first_seq + time_us.size)
+    return (receipt, time_us), [SampleStretch(twin.channels, seqs, time_us, values)]
 
 
 def _parser(content_type: str) -> Any:
@@ -72,22 +80,20 @@ def _parser(content_type: str) -> Any:
     raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{media[:60]}'")
 
 
-def _report(receipt: Receipt, batch: Batch) -> dict[str, Any]:
-    conflicts = receipt.conflicts
+def _report(receipt: Receipt, n_accepted: int) -> dict[str, Any]:
     return {
-        "accepted": int(receipt.stored.sum()),
+        "accepted": n_accepted,
         "duplicates": receipt.duplicates,
-        "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
+        "rejected": [{"index": index, "reason": "conflict"} for index in receipt.conflicts],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
 
 
-def _count(service: Service, twin: Entry, batch: Batch, receipt: Receipt) -> None:
-    n_conflicts = len(receipt.conflicts)
-    count = service.metrics.samples.labels
-    count(twin.name, "accepted").inc(batch.time_us.size - n_conflicts - receipt.duplicates)
-    count(twin.name, "duplicate").inc(receipt.duplicates)
-    count(twin.name, "rejected").inc(n_conflicts)
+def _count(service: Service, twin: str, report: dict[str, Any]) -> None:
+    outcomes = {"accepted": report["accepted"], "duplicate": report["duplicates"], "rejected": len(report["rejected"])}
+    for outcome, count in outcomes.items():
+        if count:
+            service.metrics.samples.labels(twin, outcome).inc(count)
 
 
 @router.get("", dependencies=[reads], response_model=Archive)
