@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import sys
 from collections.abc import Callable
 
 import uvicorn
@@ -15,6 +16,8 @@ from service.workbench import Workbench
 from twin_core.errors import TwinError
 
 SHUTDOWN_S = 10
+SWITCH_S = 0.001
+"""The writer needs the interpreter for a moment after each call of SQLite; by default it might wait 5 ms each time."""
 
 
 class ServerError(TwinError):
@@ -60,6 +63,7 @@ def serve(
     server = _Server(
         config, on_ready, lambda: app.state.service.hub.close(), f"http://{f'[{host}]' if ':' in host else host}:{port}"
     )
+    sys.setswitchinterval(SWITCH_S)
     with contextlib.suppress(KeyboardInterrupt), listener:  # raised again once everything is closed in good order
         server.run(sockets=[listener])
 

@@ -138,18 +138,41 @@ class Database:
         return orders, True
 
     def _commit(self, orders: list[_Order]) -> None:
-        """Run the orders in one transaction, each in its own savepoint, and answer them after the commit."""
+        """Run the orders in one transaction and answer them after the commit.
+
+        Nearly always all of them succeed. If one fails, everything is undone and done again with each order in a
+        savepoint of its own, so that it undoes itself alone.
+        """
         try:
-            self._connection.execute("BEGIN IMMEDIATE")
-            for order in orders:
-                self._attempt(order)
-            self._connection.execute("COMMIT")
+            if not self._commit_together(orders):
+                self._commit_apart(orders)
         except sqlite3.Error as error:
             self._roll_back()
             for order in orders:
                 order.error = order.error or _refusal(error)
         for order in orders:
             _answer(order)
+
+    def _commit_together(self, orders: list[_Order]) -> bool:
+        """Return whether all orders succeeded and are committed."""
+        self._connection.execute("BEGIN IMMEDIATE")
+        try:
+            for order in orders:
+                order.result = order.operation(self._connection)
+        except Exception as error:
+            self._roll_back()
+            if len(orders) > 1:
+                return False
+            orders[0].error = _refusal(error) if isinstance(error, sqlite3.Error) else error
+            return True
+        self._connection.execute("COMMIT")
+        return True
+
+    def _commit_apart(self, orders: list[_Order]) -> None:
+        self._connection.execute("BEGIN IMMEDIATE")
+        for order in orders:
+            self._attempt(order)
+        self._connection.execute("COMMIT")
 
     def _attempt(self, order: _Order) -> None:
         self._connection.execute("SAVEPOINT operation")

@@ -56,47 +56,64 @@ class Samples:
 
 def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
-    head = _head(connection, twin)
     time_us = batch.time_us
-    if time_us.size == 0:
-        return Receipt(np.empty(0, dtype=np.int8), head[0] + 1, head[1])
-    in_order = bool((time_us[1:] > time_us[:-1]).all())
-    if in_order and (head[1] is None or time_us[0] > head[1]):
-        status, n_instants = np.zeros(time_us.size, dtype=np.int8), time_us.size
-    else:
-        fate = merge(*_around(connection, twin, batch), time_us, batch.values)
-        status, n_instants = fate.status, fate.n_instants
-    kept = status == ACCEPTED
-    if not kept.any():
-        return Receipt(status, head[0] + 1, head[1])
-    stored = batch if kept.all() else Batch(time_us[kept], batch.values[:, kept])
-    last_us = _store(connection, twin, stored, head[0], n_instants)
-    return Receipt(status, head[0] + 1, last_us)
+    if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
+        head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
+        if head is not None:
+            _write(connection, twin, batch, head)
+            return Receipt(np.zeros(time_us.size, dtype=np.int8), head[0] - int(time_us.size) + 1, int(time_us[-1]))
+    return _merge_in(connection, twin, batch)
 
 
-def _head(connection: sqlite3.Connection, twin: int) -> tuple[int, int | None]:
+def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
+    """Store what is new in a batch that is late, unordered or empty."""
     row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
         raise LookupError(f"twin {twin} is gone")
-    return row[0], row[1]
+    if batch.time_us.size == 0:
+        return Receipt(np.empty(0, dtype=np.int8), row[0] + 1, row[1])
+    fate = merge(*_around(connection, twin, batch), batch.time_us, batch.values)
+    kept = fate.status == ACCEPTED
+    if not kept.any():
+        return Receipt(fate.status, row[0] + 1, row[1])
+    stored = Batch(batch.time_us[kept], batch.values[:, kept])
+    head = _advance(connection, twin, stored, fate.n_instants, after_all=False)
+    if head is None:
+        raise LookupError(f"twin {twin} is gone")
+    _write(connection, twin, stored, head)
+    return Receipt(fate.status, row[0] + 1, max(int(stored.time_us.max()), row[1] or 0))
 
 
-def _store(connection: sqlite3.Connection, twin: int, batch: Batch, seq: int, n_instants: int) -> int:
-    """Write one chunk and move the head; return the archive's last instant."""
+def _advance(
+    connection: sqlite3.Connection, twin: int, batch: Batch, n_instants: int, *, after_all: bool
+) -> tuple[int, int, int] | None:
+    """Move the head of the archive and return its number, small chunks and small rows.
+
+    With ``after_all`` only if the whole batch comes after everything that is stored; None if not.
+    """
     n = int(batch.time_us.size)
     first_us, last_us = int(batch.time_us.min()), int(batch.time_us.max())
-    _insert(connection, twin, np.arange(seq + 1, seq + 1 + n), batch.time_us, batch.values)
     small = n < SMALL
-    row = connection.execute(
+    row: tuple[int, int, int] | None = connection.execute(
         """UPDATE head SET seq = seq + ?, samples = samples + ?,
            first_us = min(coalesce(first_us, ?), ?), last_us = max(coalesce(last_us, ?), ?),
            small_chunks = small_chunks + ?, small_rows = small_rows + ?
-           WHERE twin = ? RETURNING last_us, small_chunks, small_rows""",
-        (n, n_instants, first_us, first_us, last_us, last_us, small, n if small else 0, twin),
+           WHERE twin = ? AND (last_us IS NULL OR last_us < ?) RETURNING seq, small_chunks, small_rows""",
+        (
+            *(n, n_instants, first_us, first_us, last_us, last_us, small, n if small else 0, twin),
+            first_us if after_all else 2**62,
+        ),
     ).fetchone()
-    if row[1] >= MOST_SMALL_CHUNKS or row[2] >= MOST_SMALL_ROWS:
+    return row
+
+
+def _write(connection: sqlite3.Connection, twin: int, batch: Batch, head: tuple[int, int, int]) -> None:
+    """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
+    seq, small_chunks, small_rows = head
+    n = int(batch.time_us.size)
+    _insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch.time_us, batch.values)
+    if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
         _compact(connection, twin, values_rows=batch.values.shape[0])
-    return int(row[0])
 
 
 def _insert(
