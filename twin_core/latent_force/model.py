@@ -262,6 +262,13 @@ def augment(
     return feedback, diffusion
 
 
+FEW_DISTINCT = 32
+"""Up to so many distinct steps, one matrix product each is quickest; beyond, matrices are gathered step by step."""
+
+GATHERED = 4096
+"""Steps whose matrices are gathered at once, to bound memory."""
+
+
 def drive(hold: Values, ramp: Values, index: IntArray, inputs: Values) -> Values:
     """Return hold u_start + ramp (u_end - u_start) of each step.
 
@@ -276,10 +283,14 @@ def drive(hold: Values, ramp: Values, index: IntArray, inputs: Values) -> Values
     (n_steps, n_states)
     """
     start, rise = inputs[:, 0], inputs[:, 1] - inputs[:, 0]
-    if hold.shape[0] == index.size:
-        return np.einsum("kij,kj->ki", hold, start) + np.einsum("kij,kj->ki", ramp, rise)
     out = np.zeros((index.size, hold.shape[1]), dtype=np.result_type(hold, inputs))
-    for d in range(hold.shape[0]):
-        here = index == d
-        out[here] = start[here] @ hold[d].T + rise[here] @ ramp[d].T
+    if hold.shape[0] <= FEW_DISTINCT:
+        for d in range(hold.shape[0]):
+            here = index == d
+            out[here] = start[here] @ hold[d].T + rise[here] @ ramp[d].T
+        return out
+    for first in range(0, index.size, GATHERED):
+        part = slice(first, first + GATHERED)
+        held, ramped = hold[index[part]], ramp[index[part]]
+        out[part] = np.einsum("kij,kj->ki", held, start[part]) + np.einsum("kij,kj->ki", ramped, rise[part])
     return out

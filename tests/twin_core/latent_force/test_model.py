@@ -8,7 +8,7 @@ from twin_core.errors import ModelError
 from twin_core.gp.kernels import Matern, Periodic
 from twin_core.gp.score import Slopes
 from twin_core.latent_force.linearised import Linearised
-from twin_core.latent_force.model import ForceModel
+from twin_core.latent_force.model import ForceModel, drive
 
 CAPACITY = np.array([[200.0, 500.0]])
 TIMES = np.array([0.0, 10.0, 20.0, 35.0, 45.0])
@@ -131,3 +131,17 @@ def test_repeated_times_are_told():
     network = Linearised(np.array([0.0, 1.0, 1.0, 2.0, 3.0]), _jacobian(), _network().constant_K_per_s, CAPACITY)
     with pytest.raises(ModelError, match="strictly increasing"):
         _model(network=network).linear_model(np.array([7.0, 30.0]))
+
+
+@pytest.mark.parametrize("n_repeats", [1, 40])
+def test_distinct_steps_in_any_order_meet_their_own_inputs(n_repeats: int) -> None:
+    """Tables of distinct steps are sorted, telemetry is not: every step's input acts over that step's own length."""
+    rng = np.random.default_rng(5)
+    steps = np.tile(rng.permutation(np.arange(1.0, 41.0)), n_repeats)
+    distinct, index = np.unique(steps, return_inverse=True)
+    hold = distinct[:, None, None] * np.array([[[0.5, 0.0], [0.0, 0.25]]])
+    ramp = 0.1 * hold
+    inputs = rng.normal(size=(steps.size, 2, 2))
+    rise = inputs[:, 1] - inputs[:, 0]
+    expected = steps[:, None] * np.array([0.5, 0.25]) * (inputs[:, 0] + 0.1 * rise)
+    np.testing.assert_allclose(drive(hold, ramp, index, inputs), expected, rtol=1e-13)
