@@ -144,4 +144,4 @@ def test_distinct_steps_in_any_order_meet_their_own_inputs(n_repeats: int) -> No
     inputs = rng.normal(size=(steps.size, 2, 2))
     rise = inputs[:, 1] - inputs[:, 0]
     expected = steps[:, None] * np.array([0.5, 0.25]) * (inputs[:, 0] + 0.1 * rise)
-    np.testing.assert_allclose(drive(hold, ramp, index, inputs), expected, rtol=1e-13)
+    np.testing.assert_allclose(drive(hold, ramp, index, inputs), expected, rtol=1e-13, atol=1e-12)
