@@ -5,8 +5,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from service.problems import Problem
 from service.store.twins import Twin
+from twin_core.network.plausible import plausible_range
 from twin_core.network.spec import TwinSpec, load_spec
 
 
@@ -28,6 +32,13 @@ class Entry:
     def sensors(self) -> tuple[str, ...]:
         """Every temperature channel that reads a node, in the order of the nodes."""
         return self.spec.sensors
+
+    @cached_property
+    def limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest plausible value of each channel in its own unit, (n_channels, 1) each."""
+        ranges = [plausible_range(self.spec.channels[name]) for name in self.channels]
+        low, high = np.array(ranges, dtype=np.float64).T
+        return low[:, None], high[:, None]
 
     @cached_property
     def units(self) -> dict[str, str | None]:

@@ -11,16 +11,12 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.csv_table import CsvTable, open_table
 from twin_core.errors import TelemetryError
 from twin_core.files import replacing
+from twin_core.network.plausible import LARGEST, implausible
 from twin_core.network.spec import Channel, TwinSpec
 from twin_core.telemetry import Record
 from twin_core.units import from_si, to_si
 
 TIME, TIME_S = "time", "time_s"
-HOTTEST_K = 5000.0
-"""Beyond it a temperature is a wrong unit or a marker such as 9999; the specification refuses such boundaries too."""
-LARGEST = 1e12
-"""Beyond it any value is a marker for a missing sample, not a measurement."""
-
 _FIRST_YEAR, _LAST_YEAR = 1970, 2199
 _INSTANT = re.compile(r"\d{4}-\d\d-\d\d[Tt ]\d\d:\d\d:\d\d(?:\.\d{1,9})?([Zz]|[+-]\d\d:\d\d)?", re.ASCII)
 _HOW = "write it like 2026-01-03T00:00:00Z"
@@ -81,18 +77,6 @@ def ignored_notice(name: str, columns: Sequence[str], spec: TwinSpec) -> tuple[s
     """Return the notice about columns that the specification does not declare."""
     ignored = [column for column in columns if column not in spec.channels]
     return (f"{name}: ignored columns that the specification does not name: {', '.join(ignored)}",) if ignored else ()
-
-
-def implausible(channel: Channel, values_si: FloatArray) -> tuple[int, str] | None:
-    """Return position and fault of the first value that no instrument reads, None where there is none."""
-    with np.errstate(invalid="ignore"):
-        huge = np.abs(values_si) > LARGEST
-        cold = values_si < 0.0 if channel.kind == "temperature" else np.zeros_like(huge)
-        hot = values_si > HOTTEST_K if channel.kind == "temperature" else np.zeros_like(huge)
-    for wrong, fault in ((cold, "is below absolute zero"), (hot, f"is above {HOTTEST_K:g} K"), (huge, "is too large")):
-        if wrong.any():
-            return int(np.argmax(wrong)), f"{fault}; correct the value or the channel's unit, or leave it out"
-    return None
 
 
 def write_csv(path: Path | str, record: Record, spec: TwinSpec) -> None:

@@ -56,6 +56,8 @@ INGEST = [
     Case("no time", {"values": {}}, 422, "time"),
     Case("no values", {"time": []}, 422, "values"),
     Case("an unknown member", {"time": [], "values": {}, "x": 1}, 422, "x"),
+    Case("below absolute zero", columns([1, 2], T_px=[290.0, -1e300]), 422, "values.T_px[1]"),
+    Case("hotter than any reading", columns([1], T_px=[9999.0]), 422, "values.T_px[0]"),
     Case("time is a number", columns(1, T_px=[1]), 422, "time"),
     Case("values is a list", {"time": [1], "values": [1]}, 422, "values"),
     Case("a column is a number", columns([1], T_px=1), 422, "values.T_px"),

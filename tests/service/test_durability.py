@@ -33,7 +33,7 @@ class Sender(threading.Thread):
         with contextlib.suppress(Unreachable):
             for number in range(100_000):
                 times = [float(self._lane * 10**7 + 3 * number + k) for k in range(3)]
-                report = self._client.ingest("benchsat", times, {"T_px": times})
+                report = self._client.ingest("benchsat", times, {"Q_px": times})
                 assert report.accepted == 3
                 self.acknowledged += times
 
@@ -47,6 +47,7 @@ def test_acknowledged_samples_survive_a_kill_exactly_once(tmp_path: Path) -> Non
             for sender in senders:
                 sender.start()
             while sum(len(sender.acknowledged) for sender in senders) < 300:
+                assert all(sender.is_alive() for sender in senders)
                 time.sleep(0.01)
             server.kill()
             for sender in senders:
@@ -55,7 +56,7 @@ def test_acknowledged_samples_survive_a_kill_exactly_once(tmp_path: Path) -> Non
             server.start()
             client = server.client()
             archive = client.archive("benchsat")
-            stored = archive.values["T_px"]
+            stored = archive.values["Q_px"]
             assert len(set(stored)) == len(stored) == archive.samples
             assert acknowledged <= set(stored)
             assert len(stored) - len(acknowledged) <= 3 * 4 * (
@@ -141,7 +142,7 @@ def test_full_disk_is_507_and_recovers(tmp_path: Path) -> None:
         while refusal is None:
             times = [float(stored + k) for k in range(1000)]
             try:
-                stored += client.ingest("benchsat", times, {"T_px": times}).accepted
+                stored += client.ingest("benchsat", times, {"Q_px": times}).accepted
             except ApiError as error:
                 refusal = error
         assert refusal.status == 507
@@ -150,4 +151,4 @@ def test_full_disk_is_507_and_recovers(tmp_path: Path) -> None:
     with Server(tmp_path) as server:
         client = server.client()
         assert client.archive("benchsat").samples == stored
-        assert client.ingest("benchsat", times, {"T_px": times}).accepted == 1000
+        assert client.ingest("benchsat", times, {"Q_px": times}).accepted == 1000

@@ -19,6 +19,10 @@ def client(make_client) -> AppClient:
     return client
 
 
+SCALE_K = 0.25
+"""Keeps the ramp of squares within temperatures that an instrument reads; a power of two, so that sums stay exact."""
+
+
 def send(client: AppClient, time_s: list[float], T_px: list[float | None], **more: list) -> None:
     values = {"T_px": T_px, "T_tank": [0.0] * len(time_s), "Q_px": [0.5] * len(time_s), **more}
     assert client.post(f"{TWIN}/telemetry", json={"time": time_s, "values": values}).status_code == 200
@@ -33,7 +37,7 @@ def calibrate(client: AppClient) -> None:
 
 def squares(client: AppClient) -> dict[str, float]:
     """Ramp of squares at 0..99 s, the model calibrated on them; return residuals by time."""
-    send(client, list(range(100)), [float(k * k) for k in range(100)])
+    send(client, list(range(100)), [SCALE_K * k * k for k in range(100)])
     calibrate(client)
     return residuals(client)
 
@@ -48,28 +52,28 @@ def residuals(client: AppClient, **parameters: str | int) -> dict[str, float]:
 def test_the_archive_is_assimilated_when_a_model_becomes_active(client: AppClient) -> None:
     assert residuals(client) == {}
     found = squares(client)
-    np.testing.assert_allclose(list(found.values()), [0, *[2 * k - 1 for k in range(1, 100)]])
+    np.testing.assert_allclose(list(found.values()), [0, *[SCALE_K * (2 * k - 1) for k in range(1, 100)]])
     part = residuals(client, start=10, stop="1970-01-01T00:00:12Z")
-    assert part == {"1970-01-01T00:00:10Z": 19.0, "1970-01-01T00:00:11Z": 21.0}
+    assert part == {"1970-01-01T00:00:10Z": SCALE_K * 19, "1970-01-01T00:00:11Z": SCALE_K * 21}
 
 
 def test_new_samples_go_on_from_the_state(client: AppClient) -> None:
     squares(client)
-    send(client, [100], [10_000.0])
-    send(client, [101, 102], [None, 10_003.0])
+    send(client, [100], [SCALE_K * 10_000])
+    send(client, [101, 102], [None, SCALE_K * 10_003])
     found = list(residuals(client).values())
-    assert found[100:] == [199.0, None, None]
+    assert found[100:] == [SCALE_K * 199, None, None]
     assert len(found) == 103
 
 
 def test_a_late_sample_gives_what_arrival_in_order_gives(client: AppClient) -> None:
     squares(client)
     for k in (100, 102, 103):
-        send(client, [k], [float(k * k)])
+        send(client, [k], [SCALE_K * k * k])
         residuals(client)
-    assert list(residuals(client).values())[-3:] == [199.0, 102**2 - 100**2, 205.0]
-    send(client, [101], [101.0**2])
-    assert list(residuals(client).values())[-4:] == [199.0, 201.0, 203.0, 205.0]
+    assert list(residuals(client).values())[-3:] == [SCALE_K * r for r in (199, 102**2 - 100**2, 205)]
+    send(client, [101], [SCALE_K * 101**2])
+    assert list(residuals(client).values())[-4:] == [SCALE_K * r for r in (199, 201, 203, 205)]
 
 
 def test_state_survives_a_restart(make_client) -> None:
@@ -78,9 +82,9 @@ def test_state_survives_a_restart(make_client) -> None:
     squares(first)
     first.close()
     second = make_client(workbench=FakeWorkbench)
-    send(second, [100], [10_000.0])
+    send(second, [100], [SCALE_K * 10_000])
     found = list(residuals(second).values())
-    assert len(found) == 101 and found[-1] == 199.0
+    assert len(found) == 101 and found[-1] == SCALE_K * 199
 
 
 def test_another_model_has_residuals_of_its_own(client: AppClient) -> None:
@@ -110,7 +114,7 @@ def test_network_of_the_moment(client: AppClient) -> None:
     assert client.get(f"{TWIN}/network").status_code == 409
     squares(client)
     found = client.get(f"{TWIN}/network").json()
-    assert (found["time"], found["nodes"][0]["temperature_K"]) == ("1970-01-01T00:01:39Z", 99.0**2)
+    assert (found["time"], found["nodes"][0]["temperature_K"]) == ("1970-01-01T00:01:39Z", SCALE_K * 99**2)
 
 
 WRONG_FORECASTS = (

@@ -32,7 +32,7 @@ def twin(server: Server, request: pytest.FixtureRequest) -> Iterator[str]:
 
 def send(server: Server, twin: str, *time_s: float) -> None:
     with server.client() as client:
-        client.ingest(twin, time_s, {"T_px": [290.0 + t for t in time_s]})
+        client.ingest(twin, time_s, {"T_px": [290.0 + t % 1000 for t in time_s]})
 
 
 def socket_url(server: Server, twin: str, query: str = "") -> str:

@@ -187,8 +187,10 @@ def _improve(
     for _ in range(5):
         trial = free + step
         values = parameters.to_values(trial)
-        size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
-        if posterior(trial, size, about) > before:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
+            size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
+            better = posterior(trial, size, about) > before
+        if better:
             return trial, size, about
         step = 0.35 * step
     return free, latent, tuple(nominals)

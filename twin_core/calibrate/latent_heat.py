@@ -158,13 +158,15 @@ def whiten(problem: Problem, latent: LatentHeat, nominal: Nominal, columns: Floa
 
 
 def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> float:
-    """Return the log-likelihood of the readings of all segments."""
+    """Return the log-likelihood of the readings of all segments; minus infinity where the linearisation ran away."""
     total = 0.0
     for nominal in nominals:
+        if not (np.isfinite(nominal.reference_K).all() and np.isfinite(nominal.steps.transition).all()):
+            return -np.inf
         whitened, log_det = whiten(problem, latent, nominal, nominal.residual_K[:, :, None])
         count = int(nominal.segment.valid.sum())
         total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
-    return total
+    return total if np.isfinite(total) else -np.inf
 
 
 def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:

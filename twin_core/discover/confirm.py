@@ -305,4 +305,5 @@ def _removed_share(simple: Trial, rich: Trial) -> float:
     measured = np.concatenate([s.measured_K for s in simple.fit.problem.segments])
     before, after = (np.concatenate(t.calibration.residuals) for t in (simple, rich))
     removed = float(np.nanmean(before**2) - np.nanmean(after**2))
-    return float(np.sqrt(max(removed, 0.0) / max(float(np.nanmean(np.nanvar(measured, axis=0))), 1e-300)))
+    spread = float(np.nanmean(np.nanvar(measured, axis=0))) + float(np.mean(simple.fit.problem.noise_K**2))
+    return float(np.sqrt(max(removed, 0.0) / spread))

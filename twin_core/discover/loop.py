@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin_core._typing import Json, Progress, no_progress
+from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, fit_network, to_model
 from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
-from twin_core.discover.search import Search, search, threshold
+from twin_core.discover.search import Search, search
 from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
@@ -74,7 +75,7 @@ def close_loop(
     if not 0.0 < false_alarm_rate < 1.0:
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
     begun = time.perf_counter()
-    train, held = _split(records, holdout, holdout_records, burn_in_s)
+    train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
     fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
@@ -82,7 +83,7 @@ def close_loop(
     after = to_model(found.trial.calibration, found.trial.present_effects) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
-    report = build_report(found, before, after, held, predictions, verdict_of(found, false_alarm_rate))
+    report = build_report(found, before, after, held, predictions, verdict_of(found))
     progress(0.93, "drawing")
     witness = bear_witness(found)
     report |= told_by(witness, report)
@@ -93,28 +94,33 @@ def close_loop(
 
 
 def _split(
+    spec: TwinSpec,
     records: Sequence[Record],
     holdout: float | None,
     holdout_records: Sequence[Record] | None,
     burn_in_s: float | None,
 ) -> tuple[list[Record], list[HeldOut]]:
-    """Return the training records and the hold-out."""
+    """Return the training records and the hold-out; TelemetryError where there is nothing to score."""
     if not records:
         raise TelemetryError("no telemetry given")
     if holdout_records:
-        return list(records), [split_burn_in(record, burn_in_s) for record in holdout_records]
-    return split_fraction(records, 0.3 if holdout is None else holdout)
+        train, held = list(records), [split_burn_in(record, burn_in_s) for record in holdout_records]
+    else:
+        train, held = split_fraction(records, 0.3 if holdout is None else holdout)
+    if not any(np.isfinite(measured_temperatures(spec, h.scored)[1:]).any() for h in held):
+        sensors = ", ".join(spec.sensors)
+        raise TelemetryError(
+            f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
+        )
+    return train, held
 
 
-def verdict_of(found: Search, false_alarm_rate: float) -> str:
+def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    needed = threshold(false_alarm_rate)
-    hinted = any(judged.evidence.log_bayes_factor > needed for judged in found.rejected)
-    return (
-        "unexplained" if hinted and misfit_share(found.base.calibration) > UNEXPLAINED_SHARE else "no_effect_supported"
-    )
+    unexplained = misfit_share(found.base.calibration) > UNEXPLAINED_SHARE
+    return "unexplained" if unexplained else "no_effect_supported"
 
 
 def misfit_share(calibration: Calibration) -> float:

@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    StrictBool,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from twin_core.errors import SpecError, TelemetryError
 from twin_core.units import parse_instant_ns
@@ -75,7 +84,7 @@ class Channel(_Strict):
     unit: str | None = None
     noise_std: Positive | None = None
     interpolation: Literal["hold", "linear"] | None = None
-    levels: bool = False
+    levels: StrictBool = False
 
     @model_validator(mode="after")
     def _unit_fits_kind(self) -> Self:
@@ -156,7 +165,7 @@ class Load(_Strict):
     node: Name
     weight: Fraction = 1.0
     gain: Quantity | None = None
-    solar: bool = False
+    solar: StrictBool = False
     table: Table | None = None
 
 
@@ -228,6 +237,9 @@ class TwinSpec(_Strict):
                 if sensor in seen:
                     yield f"nodes[{i}].sensor: '{sensor}' already reads node '{seen[sensor]}'"
                 seen[sensor] = node.id
+        for name, boundary in self.boundaries.items():
+            if boundary.channel in seen:
+                yield f"boundaries.{name}.channel: '{boundary.channel}' reads node '{seen[boundary.channel]}'; one of both"
         if not seen:
             yield "nodes: none has a sensor; name the temperature channel of at least one node"
         yield from self._check_conductors(nodes)
@@ -262,6 +274,8 @@ class TwinSpec(_Strict):
             channel = self.channels[load.channel]
             if load.table is None and channel.kind == "auxiliary":
                 yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
+            if load.table is not None and channel.kind == "power":
+                yield f"loads[{i}].table: '{load.channel}' is heat already; a table explains an auxiliary channel"
             if load.table is not None and load.gain is not None:
                 yield f"loads[{i}].gain: a load with a table has no gain; its values are calibrated"
             if load.table is not None and channel.levels is False and load.table.knots is None:

@@ -118,3 +118,24 @@ def test_guess_or(pair: dict[str, Any]) -> None:
     assert guess_or(bounded, 5.0) == pytest.approx(10.0)  # the geometric mean of the bounds
     assert guess_or(known, 5.0) == 7.0
     assert guess_or(None, 5.0) == 5.0
+
+
+def test_a_table_explains_no_heat(pair: dict[str, Any]) -> None:
+    pair["channels"]["Q_extra"] = {"kind": "power", "unit": "W"}
+    pair["loads"] = [{"channel": "Q_extra", "node": pair["nodes"][0]["id"], "table": {"knots": [0, 1]}}]
+    with pytest.raises(SpecError, match=r"loads\[0\]\.table: 'Q_extra' is heat already"):
+        load_spec(pair)
+
+
+def test_a_boundary_is_no_modelled_node(pair: dict[str, Any]) -> None:
+    sensor = pair["nodes"][0]["sensor"]
+    pair["boundaries"] = {"wall": {"channel": sensor}}
+    with pytest.raises(SpecError, match=r"boundaries\.wall\.channel: .* reads node"):
+        load_spec(pair)
+
+
+def test_solar_is_true_or_false(pair: dict[str, Any]) -> None:
+    pair["channels"]["Q_sun"] = {"kind": "power", "unit": "W"}
+    pair["loads"] = [{"channel": "Q_sun", "node": pair["nodes"][0]["id"], "solar": "yes"}]
+    with pytest.raises(SpecError, match=r"loads\[0\]\.solar"):
+        load_spec(pair)
