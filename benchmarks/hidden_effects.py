@@ -1,0 +1,119 @@
+"""What the seeded spacecraft hide: one small function per effect, written from the contract's equations alone."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from benchmarks.network_world import SIGMA, SPACE_K, Heat, Hidden, World
+
+
+def _into(world: World, node: int, q: Callable[[float, int, float], float]) -> Heat:
+    """Return a heat into one node that depends on its own temperature."""
+
+    def heat(t: float, k: int, x: np.ndarray) -> np.ndarray:
+        more = np.zeros(world.n)
+        more[node] = q(t, k, x[node])
+        return more
+
+    return heat
+
+
+def _between(world: World, a: int, b: int, q: Callable[[float, int, np.ndarray], float]) -> Heat:
+    """Return a heat into node a that leaves node b."""
+
+    def heat(t: float, k: int, x: np.ndarray) -> np.ndarray:
+        more = np.zeros(world.n)
+        more[a] = q(t, k, x)
+        more[b] = -more[a]
+        return more
+
+    return heat
+
+
+def _free_pair(world: World) -> tuple[int, int]:
+    """Return a pair of nodes that no conductor joins."""
+    pairs = [(a, b) for a in range(world.n) for b in range(a + 1, world.n) if (a, b) not in world.edges]
+    return pairs[int(world.rng.integers(0, len(pairs)))]
+
+
+def radiation_to_sink(world: World, node: int) -> Hidden:
+    """Return radiation to space."""
+    area = float(world.rng.uniform(0.05, 0.15))
+    heat = _into(world, node, lambda t, k, x: SIGMA * area * (SPACE_K**4 - x**4))
+    return Hidden({"node": f"n{node}", "sink": "space"}, heat)
+
+
+def leak_to_boundary(world: World, node: int) -> Hidden:
+    """Return a leak to the room."""
+    g = float(world.rng.uniform(0.3, 1.5))
+    heat = _into(world, node, lambda t, k, x: g * (world.room_K[k] - x))
+    return Hidden({"node": f"n{node}", "boundary": "room"}, heat)
+
+
+def constant_heat_load(world: World, node: int) -> Hidden:
+    """Return a constant heat of either sign."""
+    q0 = world.mean_load_W * float(world.rng.uniform(0.2, 0.5)) * world.rng.choice([-1.0, 1.0])
+    return Hidden({"node": f"n{node}"}, _into(world, node, lambda t, k, x: q0))
+
+
+def channel_heat_load(world: World, node: int) -> Hidden:
+    """Return a heat per mode."""
+    table = world.mean_load_W * world.rng.uniform(0.2, 0.8, 3) * np.array([0.0, 1.0, -0.6])
+    heat = _into(world, node, lambda t, k, x: table[int(world.mode[k])])
+    return Hidden({"node": f"n{node}", "channel": "mode"}, heat)
+
+
+def proportional_heater(world: World, node: int) -> Hidden:
+    """Return a heater that works below the 60 % quantile of the healthy temperatures."""
+    gain, limit = float(world.rng.uniform(2.0, 6.0)), world.mean_load_W * float(world.rng.uniform(0.4, 0.9))
+    set_point = float(np.quantile(world.simulate()[:, node], 0.6))
+    heat = _into(world, node, lambda t, k, x: min(limit, gain * max(set_point - x, 0.0)))
+    return Hidden({"node": f"n{node}"}, heat)
+
+
+def input_gain(world: World, node: int) -> Hidden:
+    """Return a payload heat that is delivered at another scale."""
+    channel = int(world.rng.choice(list(world.power)))
+    g = float(world.rng.choice([world.rng.uniform(0.5, 0.8), world.rng.uniform(1.2, 1.5)]))
+    heat = _into(world, channel, lambda t, k, x: (g - 1.0) * world.power[channel][k])
+    return Hidden({"channel": f"P{channel}"}, heat)
+
+
+def missing_conductor(world: World, node: int) -> Hidden:
+    """Return a strap."""
+    a, b = _free_pair(world)
+    g = float(world.rng.uniform(0.5, 2.0))
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, _between(world, a, b, lambda t, k, x: g * (x[b] - x[a])))
+
+
+def hidden_mass(world: World, node: int) -> Hidden:
+    """Return a mass behind a conductance."""
+    mass = float(world.capacity[node] * world.rng.uniform(0.5, 2.0))
+    g = mass / float(world.rng.uniform(0.2, 1.0) * world.period_s)
+
+    def heat(t: float, k: int, x: np.ndarray) -> np.ndarray:
+        more = np.zeros(world.n)
+        more[node] = g * (x[world.n] - x[node])
+        return more
+
+    return Hidden(
+        {"node": f"n{node}"},
+        heat,
+        rates=lambda x: np.array([g * (x[node] - x[world.n]) / mass]),
+        n_extra=1,
+    )
+
+
+HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
+    make.__name__: make
+    for make in (
+        radiation_to_sink,
+        leak_to_boundary,
+        constant_heat_load,
+        channel_heat_load,
+        proportional_heater,
+        input_gain,
+        missing_conductor,
+        hidden_mass,
+    )
+}
