@@ -152,7 +152,9 @@ def survey_of(network: Network, along: Along, channel_levels: dict[str, tuple[fl
     balance = evaluate_balance(network, network.parameters.values, along)
     levels = {"mode": (0.0, 1.0, 2.0)} if channel_levels is None else channel_levels
     capacity = network.parameters.values[network.capacity_index]
-    return Survey(network.layout, along, balance.rate_K_per_s, capacity, levels, (0, along.time_s.size))
+    named = network.parameters.as_dict()
+    edges = (0, along.time_s.size)
+    return Survey(network.layout, along, balance.rate_K_per_s, capacity, levels, edges, named, along.time_s)
 
 
 def null_effects(kind: type[Effect]) -> list[Effect]:

@@ -15,6 +15,7 @@ from twin_core.calibrate.starting import filled_columns
 from twin_core.errors import TelemetryError
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.state_space import LinearModel
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.one_step import one_step
@@ -141,12 +142,8 @@ def assimilate(model: CalibratedModel, record: Record, state: Json | None = None
 
 def _readings(model: CalibratedModel, network: Network, record: Record) -> FloatArray:
     """Return the readings with known sensor faults taken off, (n_times, n_sensors)."""
-    measured = measured_temperatures(model.spec, record)
-    values = network.parameters.values
-    for term in network.readings:
-        part = term.evaluate(record.time_s, values[network.term_index(term)])
-        measured[:, part.sensor] -= part.offset_K
-    return measured
+    offset_K = reading_offsets_K(network, network.parameters.values, record.clock_s)
+    return measured_temperatures(model.spec, record) - offset_K
 
 
 def _prior(network: Network, measured: FloatArray, record: Record, state: Json | None) -> tuple[FloatArray, FloatArray]:

@@ -67,7 +67,7 @@ def _moment(model: CalibratedModel, network: Network, record: Record, temperatur
     forcing = build_forcing(network, future, model.max_step_s)
     boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_K[0, :1])
     return Along(
-        forcing.stage_time_s[0, :1],
+        forcing.stage_time_s[0, :1] + forcing.epoch_s,
         temperatures_K[None, :],
         boundaries,
         {name: series[0, :1] for name, series in forcing.inputs.items()},

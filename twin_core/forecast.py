@@ -10,6 +10,7 @@ from twin_core._typing import FloatArray, Json
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.forcing import Forcing, build_forcing
@@ -90,10 +91,8 @@ def forecast(
     path = rollout(network, values, present_K, forcing)
     if not path.converged:
         raise ModelError("the heat balance has no solution over the horizon: check the planned inputs")
-    read = path.at_samples(forcing.sample_step)[:, network.sensor_node].copy()
-    for term in network.readings:
-        part = term.evaluate(future.time_s, values[network.term_index(term)])
-        read[:, part.sensor] += part.offset_K
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
+    read += reading_offsets_K(network, values, future.clock_s)
     wanted = np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:])
     std = np.sqrt(_variance(model, network, forcing, path, covariance_K2, future.time_s))[wanted]
     mean = read[wanted]

@@ -69,6 +69,16 @@ class Record:
             self.notices,
         )
 
+    @property
+    def epoch_s(self) -> float:
+        """The clock at ``time_s = 0``: unix seconds of a dated record; 0 otherwise, its own seconds being the clock."""
+        return 0.0 if self.epoch_ns is None else self.epoch_ns / 1e9
+
+    @property
+    def clock_s(self) -> FloatArray:
+        """The samples on the clock that dated records share, (n_times,): an instant is one number in all of them."""
+        return self.time_s + self.epoch_s
+
     def present(self, time_s: float) -> str | float:
         """Return a time in the telemetry's own form: RFC 3339 where the record is dated, else seconds."""
         return float(time_s) if self.epoch_ns is None else format_instant(self.epoch_ns + round(float(time_s) * 1e9))

@@ -56,3 +56,12 @@ def test_undated_time_is_a_number() -> None:
     assert record([5.0]).present(5.0) == 5.0
     with pytest.raises(TelemetryError, match="is a date, the record counts seconds"):
         record([5.0]).locate_s("2026-01-01T00:00:00Z")
+
+
+def test_an_instant_is_one_number_in_every_dated_record() -> None:
+    instant_ns = 1_767_312_000_000_000_000
+    early = Record(np.array([0.0, 600.0]), {}, instant_ns)
+    late = Record(np.array([-600.0, 0.0]), {}, instant_ns + 600_000_000_000)
+    np.testing.assert_array_equal(early.clock_s, [1_767_312_000.0, 1_767_312_600.0])
+    np.testing.assert_array_equal(early.clock_s, late.clock_s)
+    np.testing.assert_array_equal(Record(np.array([5.0, 6.0]), {}).clock_s, [5.0, 6.0])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.parameters.transforms import Identity
+from twin_core.parameters.transforms import Identity, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
 
 UNSEEN_STD = 1.0
@@ -23,7 +23,8 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     Returns
     -------
     list of str
-        Positive parameters uncertain by more than a factor e; signed ones uncertain by more than their own size.
+        Positive parameters uncertain by more than a factor e, signed ones by more than their own size, others by one in
+        the solver's coordinate: a whole share, or the whole record.
     """
     names = []
     for position, index in enumerate(parameters.free_index):
@@ -36,9 +37,7 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
 
 def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str | None:
     """Return in words the combination of free parameters that the data tell least; None if all is well told."""
-    logarithmic = [
-        k for k, i in enumerate(parameters.free_index) if not isinstance(parameters.parameters[i].transform, Identity)
-    ]
+    logarithmic = [k for k, i in enumerate(parameters.free_index) if is_logarithmic(parameters.parameters[i].transform)]
     if len(logarithmic) < 2:
         return None
     block = covariance[np.ix_(logarithmic, logarithmic)]

@@ -17,6 +17,7 @@ from twin_core.calibrate.whitening import affine_march, whiten_columns
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.smoother import smooth
 from twin_core.gp.state_space import LinearModel
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.kernels import GAMMA, march_sensitivities
 from twin_core.simulate.one_step import Steps, one_step
@@ -44,13 +45,18 @@ class LatentHeat:
 
 @dataclass(frozen=True)
 class Nominal:
-    """One segment linearised about temperatures close to the measured ones."""
+    """One segment linearised about temperatures close to the measured ones.
+
+    ``reference_K`` and ``offset_K``, (n_samples, n_sensors), are what the linearised model reads without undeclared heat,
+    and what of it are sensor faults.
+    """
 
     segment: Segment
     starts_K: FloatArray
     extra_W: FloatArray
     steps: Steps
     reference_K: FloatArray
+    offset_K: FloatArray
     sample_of: np.ndarray
 
     @property
@@ -123,11 +129,9 @@ def linearise(
     reference = affine_march(steps.transition, offset, segment.start_prior_K)
     sample_of = np.full(forcing.n_steps + 1, -1, dtype=np.int64)
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
-    read = reference[forcing.sample_step][:, network.sensor_node]
-    for term in network.readings:
-        part = term.evaluate(segment.record.time_s, values[network.term_index(term)])
-        read[:, part.sensor] += part.offset_K
-    return Nominal(segment, states_K[:-1], extra_W, steps, read, sample_of)
+    offset_K = reading_offsets_K(network, values, segment.record.clock_s)
+    read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
+    return Nominal(segment, states_K[:-1], extra_W, steps, read, offset_K, sample_of)
 
 
 def floor_K2(problem: Problem) -> FloatArray:
@@ -202,13 +206,7 @@ def smoothed_states(
     n, forcing = problem.n_nodes, nominal.segment.forcing
     model = _augmented(problem, latent, nominal)
     stretched = np.full((forcing.n_steps + 1, problem.network.sensor_node.size), np.nan)
-    read = nominal.segment.measured_K.copy()
-    for term in problem.network.readings:
-        part = term.evaluate(
-            nominal.segment.record.time_s, problem.network.parameters.values[problem.network.term_index(term)]
-        )
-        read[:, part.sensor] -= part.offset_K
-    stretched[forcing.sample_step] = read
+    stretched[forcing.sample_step] = nominal.segment.measured_K - nominal.offset_K
     smoothed = smooth(model, kalman_filter(model, stretched, keep="states"))
     return smoothed.mean[:, :n], smoothed.mean[:, n:], np.sqrt(np.maximum(smoothed.variance[:, n:], 0.0))
 

@@ -7,9 +7,10 @@ import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.errors import TelemetryError
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.network.spec import Interval, TwinSpec
-from twin_core.parameters.transforms import Identity
+from twin_core.parameters.transforms import is_logarithmic
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.rollout import Rollout, rollout, sensitivities
 from twin_core.telemetry import Record
@@ -144,7 +145,7 @@ class Problem:
     def logarithmic(self) -> IntArray:
         """Positions in the unknown vector of the parameters whose solver coordinate is logarithmic."""
         free = [self.network.parameters.parameters[i] for i in self.network.parameters.free_index]
-        return np.array([k for k, p in enumerate(free) if not isinstance(p.transform, Identity)], dtype=np.int64)
+        return np.array([k for k, p in enumerate(free) if is_logarithmic(p.transform)], dtype=np.int64)
 
     def start(self) -> FloatArray:
         """Return the unknown vector at the network's present values and the prior initial states."""
@@ -184,11 +185,8 @@ class Problem:
 
     def _readings(self, values: FloatArray, segment: Segment, path: Rollout) -> FloatArray:
         """Return what the sensors read along a trajectory, (n_samples, n_sensors)."""
-        read = path.at_samples(segment.forcing.sample_step)[:, self.network.sensor_node].copy()
-        for term in self.network.readings:
-            part = term.evaluate(segment.record.time_s, values[self.network.term_index(term)])
-            read[:, part.sensor] += part.offset_K
-        return read
+        read = path.at_samples(segment.forcing.sample_step)[:, self.network.sensor_node]
+        return read + reading_offsets_K(self.network, values, segment.record.clock_s)
 
     def residuals(self, fit: Fit) -> list[FloatArray]:
         """Return measured minus modelled per segment, (n_samples, n_sensors), NaN where missing."""
@@ -219,7 +217,7 @@ class Problem:
         at = parameters.at_values(values)
         for term in self.network.readings:
             index = self.network.term_index(term)
-            part = term.evaluate(segment.record.time_s, values[index])
+            part = term.evaluate(segment.record.clock_s, values[index])
             for item, series in part.d_values:
                 if int(index[item]) in position:
                     parameter = at.parameters[int(index[item])]
@@ -262,10 +260,15 @@ def build_problem(
     Raises
     ------
     TelemetryError
-        If there is no record, or one of them cannot be used.
+        If there is no record, one of them cannot be used, or only some carry dates.
     """
     if not records:
         raise TelemetryError("no telemetry given")
+    undated = [r.name for r in records if r.epoch_ns is None]
+    if undated and len(undated) < len(records):
+        raise TelemetryError(
+            f"{undated[0]}: counts seconds, other files carry dates; give all of them one kind of time"
+        )
     segments = tuple(build_segment(network, r, max_step_s) for r in records)
     for column, sensor in enumerate(network.spec.sensors):
         if not any(segment.valid[:, column].any() for segment in segments):

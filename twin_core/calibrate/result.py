@@ -12,7 +12,7 @@ from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import TwinSpec, dump_spec, load_spec
-from twin_core.parameters.transforms import Identity
+from twin_core.parameters.transforms import is_logarithmic
 
 FORMAT = "thermal-twin-model/1"
 
@@ -155,5 +155,5 @@ class CalibratedModel:
         if self.free_names and self.free_names != parameters.free_names:
             raise SpecError("free_names: are not the free parameters of the specification and its effects")
         for parameter in parameters.parameters:
-            if not isinstance(parameter.transform, Identity) and not parameter.value > 0.0:
+            if is_logarithmic(parameter.transform) and not parameter.value > 0.0:
                 raise SpecError(f"values.{parameter.name}: must be positive")

@@ -10,6 +10,7 @@ from twin_core.assimilate import assimilate
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import TelemetryError
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -113,9 +114,7 @@ def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
     state = assimilate(model, held.lead).mean_K
     forcing = build_forcing(network, held.scored, model.max_step_s)
     path = rollout(network, values, state, forcing)
-    read = path.at_samples(forcing.sample_step)[:, network.sensor_node].copy()
-    for term in network.readings:
-        part = term.evaluate(held.scored.time_s, values[network.term_index(term)])
-        read[:, part.sensor] += part.offset_K
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
+    read += reading_offsets_K(network, values, held.scored.clock_s)
     measured = measured_temperatures(model.spec, held.scored)
     return Prediction(held.scored.time_s[1:], measured[1:], read[1:])

@@ -73,6 +73,9 @@ def survey_of(fit: HeatFit) -> Survey:
         values[network.capacity_index],
         levels,
         tuple(int(e) for e in edges),
+        fit.network.parameters.as_dict(),
+        np.concatenate([r.clock_s[n.segment.valid.any(axis=1)] for r, n in zip(records, fit.nominals, strict=True)]),
+        records[0].epoch_ns is not None,
     )
 
 

@@ -21,7 +21,7 @@ from twin_core.latent_force.network import linearise_network, on_grid
 from twin_core.latent_force.polynomial import ForcePolynomial
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_extended
-from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.dynamics import fill_boundaries, reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
 
@@ -257,11 +257,8 @@ def _model(fit: HeatFit, nominal: Nominal, view: _View, at: Sequence[int], state
 
 def _readings(network: Network, nominal: Nominal) -> FloatArray:
     """Return the measured temperatures without the network's own reading faults, (n_samples, n_sensors)."""
-    read, values = nominal.segment.measured_K.copy(), network.parameters.values
-    for term in network.readings:
-        part = term.evaluate(nominal.segment.record.time_s, values[network.term_index(term)])
-        read[:, part.sensor] -= part.offset_K
-    return read
+    offset_K = reading_offsets_K(network, network.parameters.values, nominal.segment.record.clock_s)
+    return nominal.segment.measured_K - offset_K
 
 
 def _laws(

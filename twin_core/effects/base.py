@@ -4,7 +4,7 @@ Adding one is one file with a subclass, and one line in the registry of ``twin_c
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, Self
@@ -14,7 +14,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.errors import ModelError
 from twin_core.network.model import Addition, ExtraNode, Layout
-from twin_core.network.terms import Along
+from twin_core.network.terms import Along, ReadingTerm, Term
 from twin_core.parameters.parameter import Parameter
 from twin_core.parameters.transforms import Identity, Log
 
@@ -62,6 +62,12 @@ class Survey:
         Auxiliary channel -> resting values, for those declared with levels.
     segment_edges
         Positions in the points where segments begin, and the end.
+    parameters
+        Full name -> calibrated value of every parameter of the declared model.
+    sample_s : (n_samples,)
+        When something was read, on the clock of ``along``.
+    dated
+        Whether that clock shows dates or a file's own seconds.
     """
 
     layout: Layout
@@ -70,6 +76,9 @@ class Survey:
     capacity_J_per_K: FloatArray
     channel_levels: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     segment_edges: tuple[int, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    sample_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    dated: bool = False
 
     def temperature_K(self, node: str) -> FloatArray:
         """Return a node's temperature along the record, (n_points,)."""
@@ -184,26 +193,38 @@ class Effect(ABC):
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
         """Return d heat / d amplitude along the survey: per amplitude a list of (node, (n_points,) in W per unit)."""
-        columns: list[list[tuple[int, FloatArray]]] = []
-        parameters = [p.name for p in self.parameters()]
-        wanted = {parameters[i]: k for k, i in enumerate(self.amplitudes)}
-        columns = [[] for _ in wanted]
-        for term in self.addition(survey.layout).terms:
-            own = [p.name for p in term.parameters]
-            numbers = np.array([self._null_value(name) for name in own] + [1.0] * len(term.borrows))
-            for entry in term.evaluate(survey.along, numbers).d_values:
-                if entry.item < len(own) and own[entry.item] in wanted:
-                    columns[wanted[own[entry.item]]].append((entry.node, entry.series))
+        columns: list[list[tuple[int, FloatArray]]] = [[] for _ in self.amplitudes]
+        for term in self._alone(survey.layout).terms:
+            scaled = self._scaled_by(term.parameters)
+            for entry in term.evaluate(survey.along, self._null_values(term, survey)).d_values:
+                if entry.item in scaled:
+                    columns[scaled[entry.item]].append((entry.node, entry.series))
         return columns
 
     def unit_readings(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
         """Return d reading / d amplitude along the survey: per amplitude a list of (sensor, (n_points,) in K per unit)."""
-        return [[] for _ in self.amplitudes]
+        columns: list[list[tuple[int, FloatArray]]] = [[] for _ in self.amplitudes]
+        for term in self._alone(survey.layout).readings:
+            scaled = self._scaled_by(term.parameters)
+            reading = term.evaluate(survey.along.time_s, self._null_values(term, survey))
+            for item, series in reading.d_values:
+                if item in scaled:
+                    columns[scaled[item]].append((reading.sensor, series))
+        return columns
 
-    def _null_value(self, full_name: str) -> float:
-        short = full_name.removeprefix(f"{self.label}.")
-        quality = next(q for q in self.qualities() if q.name == short)
-        return float(self.values[short]) if quality.null is None else quality.null
+    def _alone(self, layout: Layout) -> Addition:
+        """Return the terms over a layout that has only its own states added."""
+        return self.addition(replace(layout, nodes=layout.nodes + tuple(n.name for n in self.extra_nodes(layout))))
+
+    def _scaled_by(self, own: Sequence[Parameter]) -> dict[int, int]:
+        """Return position among a term's own parameters -> which amplitude it is."""
+        names = [f"{self.label}.{self.qualities()[i].name}" for i in self.amplitudes]
+        return {i: names.index(p.name) for i, p in enumerate(own) if p.name in names}
+
+    def _null_values(self, term: Term | ReadingTerm, survey: Survey) -> FloatArray:
+        """Return a term's values where the effect vanishes, then those that it borrows from the declared model."""
+        null = {f"{self.label}.{q.name}": self.values[q.name] if q.null is None else q.null for q in self.qualities()}
+        return np.array([null[p.name] for p in term.parameters] + [survey.parameters[name] for name in term.borrows])
 
 
 def require(where: Where, keys: tuple[str, ...], effect: str) -> None:

@@ -102,6 +102,25 @@ def evaluate_balance(
     return _free_entries(network, values, rate, jacobian, heat, capacity, rows)
 
 
+def reading_offsets_K(network: Network, values: FloatArray, clock_s: FloatArray) -> FloatArray:
+    """Return what the sensors read beyond the temperature of their states, (n_times, n_sensors).
+
+    Parameters
+    ----------
+    network
+        The network with its sensor faults.
+    values : (n_parameters,)
+        Physical parameter values.
+    clock_s : (n_times,)
+        Sample times, as of ``Record.clock_s``.
+    """
+    offset = np.zeros((clock_s.size, network.sensor_node.size))
+    for term in network.readings:
+        part = term.evaluate(clock_s, values[network.term_index(term)])
+        offset[:, part.sensor] += part.offset_K
+    return offset
+
+
 def _capacities(network: Network, values: FloatArray, along: Along) -> tuple[FloatArray, FloatArray, list[Entry]]:
     """Return the capacity of each node (n_points, n_nodes), its slope with temperature, and derivative entries of C."""
     n_points, n_nodes = along.temperatures_K.shape

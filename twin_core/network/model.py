@@ -1,7 +1,7 @@
 """A network ready to be evaluated: the declared specification and any added effects as terms over one parameter set."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -54,6 +54,8 @@ class Addition:
     capacities: tuple[CapacityTerm, ...] = ()
     readings: tuple[ReadingTerm, ...] = ()
     nodes: tuple[ExtraNode, ...] = ()
+    dated: bool | None = None
+    """Whether the instants that it knows are dates or a file's own seconds; None where it knows no instant."""
 
 
 class Extension(Protocol):
@@ -153,6 +155,10 @@ class Network:
         The heat balance, temperature-dependent capacity, and sensor faults.
     sensor_node : (n_sensors,)
         Position of the state that each sensor reads.
+    extra
+        States that effects added.
+    dated
+        Whether instants in the effects are dates or a file's own seconds; None where they know none.
     """
 
     layout: Layout
@@ -162,6 +168,7 @@ class Network:
     readings: tuple[ReadingTerm, ...]
     sensor_node: IntArray
     extra: tuple[ExtraNode, ...]
+    dated: bool | None = None
 
     @property
     def spec(self) -> TwinSpec:
@@ -203,9 +210,7 @@ class Network:
 
     def with_parameters(self, parameters: ParameterSet) -> "Network":
         """Return the network with another parameter set over the same names."""
-        return Network(
-            self.layout, parameters, self.terms, self.capacities, self.readings, self.sensor_node, self.extra
-        )
+        return replace(self, parameters=parameters)
 
 
 def build_network(
@@ -266,6 +271,7 @@ def build_network(
         readings,
         np.array(sensor_node, dtype=np.int64),
         extra,
+        next((a.dated for a in additions if a.dated is not None), None),
     )
 
 

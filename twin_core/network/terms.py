@@ -22,6 +22,7 @@ class Along:
     Attributes
     ----------
     time_s : (n_points,)
+        On the clock of ``Record.clock_s``: an instant is the same number in every record.
     temperatures_K : (n_points, n_nodes)
     boundaries_K : (n_points, n_boundaries)
     inputs : channel -> (n_points,)
@@ -138,7 +139,7 @@ class ReadingTerm(Protocol):
         ...
 
     def evaluate(self, time_s: FloatArray, values: FloatArray) -> Reading:
-        """Return the offset and derivatives at the sample times."""
+        """Return the offset and derivatives at the sample times, on the clock of ``Record.clock_s``."""
         ...
 
 

@@ -41,6 +41,49 @@ class Identity:
 
 
 @dataclass(frozen=True)
+class Shifted:
+    """value = reference + scale * free: an instant, whose own number is too large for relative tolerances."""
+
+    reference: float
+    scale: float
+
+    def to_value(self, free: float) -> float:
+        """Return reference + scale * free."""
+        return self.reference + self.scale * free
+
+    def to_free(self, value: float) -> float:
+        """Return the distance from the reference in scales."""
+        return (value - self.reference) / self.scale
+
+    def slope(self, free: float) -> float:
+        """Return the scale."""
+        return self.scale
+
+
+@dataclass(frozen=True)
+class Floored:
+    """value = max(free, lower): a quantity that may reach its bound, as a share that falls to nothing does.
+
+    The slope stays one below the bound: a solver that sits there may come back, and a standard deviation is that of the
+    quantity without its bound.
+    """
+
+    lower: float
+
+    def to_value(self, free: float) -> float:
+        """Return the number, or the bound where it lies below."""
+        return max(free, self.lower)
+
+    def to_free(self, value: float) -> float:
+        """Return the value."""
+        return value
+
+    def slope(self, free: float) -> float:
+        """Return one."""
+        return 1.0
+
+
+@dataclass(frozen=True)
 class Log:
     """value = exp(free): a positive quantity of unknown order of magnitude."""
 
@@ -80,3 +123,8 @@ class LogInterval:
         """Return d value / d free by the chain rule."""
         position = float(expit(free))
         return self.to_value(free) * self._span() * position * (1.0 - position)
+
+
+def is_logarithmic(transform: Transform) -> bool:
+    """Return whether a step of one in the free number is a change by some factor, so that values stay positive."""
+    return isinstance(transform, Log | LogInterval)

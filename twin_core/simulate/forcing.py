@@ -21,6 +21,8 @@ class Forcing:
 
     Attributes
     ----------
+    epoch_s
+        The clock at time 0 (``Record.epoch_s``).
     start_s
         Time of the initial state.
     step_s : (n_steps,)
@@ -33,6 +35,7 @@ class Forcing:
     sun_factor : (n_steps, 2)
     """
 
+    epoch_s: float
     start_s: float
     step_s: FloatArray
     stage_time_s: FloatArray
@@ -54,7 +57,7 @@ class Forcing:
         """Return the stage points of steps first..last-1 flattened to (2 n_steps, ...), at given temperatures."""
         window = slice(first, last)
         return Along(
-            self.stage_time_s[window].ravel(),
+            self.stage_time_s[window].ravel() + self.epoch_s,
             temperatures_K,
             boundaries_K,
             {name: series[window].ravel() for name, series in self.inputs.items()},
@@ -93,9 +96,11 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     Raises
     ------
     TelemetryError
-        If a channel that drives the network is missing or empty, or a solar load meets a record without dates.
+        If a channel that drives the network is missing or empty, a solar load meets a record without dates, or the
+        network knows instants in another form than the record's.
     """
     spec = network.spec
+    _check_clock(network, record)
     intervals = np.diff(record.time_s)
     divisions = np.maximum(1, np.ceil(intervals / max_step_s - 1e-9)).astype(np.int64)
     step = np.repeat(intervals / divisions, divisions)
@@ -117,7 +122,18 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     }
     sample_step = np.concatenate([[0], np.cumsum(divisions)])
     sun = _sun_factor(spec, record, stage_time)
-    return Forcing(float(record.time_s[0]), step, stage_time, sample_step, boundaries, inputs, sun)
+    start = float(record.time_s[0])
+    return Forcing(record.epoch_s, start, step, stage_time, sample_step, boundaries, inputs, sun)
+
+
+def _check_clock(network: Network, record: Record) -> None:
+    """Refuse a record whose clock is not the one in which the network's effects know their instants."""
+    if network.dated is not None and network.dated != (record.epoch_ns is not None):
+        known, given = ("dates", "counts seconds") if network.dated else ("seconds of a file", "carries dates")
+        raise TelemetryError(
+            f"{record.name}: the model knows when its effects set in as {known}, the record {given}; "
+            f"give a '{'time' if network.dated else 'time_s'}' column"
+        )
 
 
 def _driving_channels(spec: TwinSpec, record: Record) -> tuple[str, ...]:

@@ -111,3 +111,10 @@ def test_an_interval_in_dates_meets_a_dated_record_alone() -> None:
 def test_no_records_are_refused() -> None:
     with pytest.raises(TelemetryError, match="no telemetry given"):
         build_problem(every_term_network(), [], np.ones(2))
+
+
+def test_files_with_and_without_dates_do_not_mix() -> None:
+    dated = replace(orbit(20, 1), epoch_ns=0, name="dated.csv")
+    bare = replace(orbit(20, 2), epoch_ns=None, name="bare.csv")
+    with pytest.raises(TelemetryError, match=r"bare\.csv: counts seconds, other files carry dates"):
+        build_problem(every_term_network(), [dated, bare], np.ones(2))

@@ -62,7 +62,7 @@ def readings_with(p: Problem, effects: list[Effect]) -> list[np.ndarray]:
         path = rollout(network, network.parameters.values, start, before.forcing)
         read = path.at_samples(before.forcing.sample_step)[:, network.sensor_node]
         for term in network.readings:
-            part = term.evaluate(before.record.time_s, network.parameters.values[network.term_index(term)])
+            part = term.evaluate(before.record.clock_s, network.parameters.values[network.term_index(term)])
             read[:, part.sensor] += part.offset_K
         found.append(read)
     return found

@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import central_difference
-from twin_core.parameters.transforms import Identity, Log, LogInterval, Transform
+from twin_core.parameters.transforms import Floored, Identity, Log, LogInterval, Shifted, Transform, is_logarithmic
 
 INTERVAL = LogInterval(2.0e-3, 50.0)
-TRANSFORMS: tuple[Transform, ...] = (Identity(), Log(), INTERVAL)
+TRANSFORMS: tuple[Transform, ...] = (Identity(), Log(), INTERVAL, Shifted(40.0, 8.0), Floored(-30.0))
 each_transform = pytest.mark.parametrize("transform", TRANSFORMS, ids=lambda t: type(t).__name__)
 
 
@@ -58,3 +58,21 @@ def test_a_guess_on_a_bound_can_still_move(value: float) -> None:
     assert np.isfinite(free)
     assert INTERVAL.to_value(free) == pytest.approx(value, rel=2e-5)
     assert INTERVAL.slope(free) > 0.0
+
+
+@given(seconds=st.floats(0.0, 1e5))
+def test_an_instant_keeps_its_microseconds_and_its_conditioning(seconds: float) -> None:
+    transform = Shifted(1.77e9, 5.0e4)
+    free = transform.to_free(1.77e9 + seconds)
+    assert 0.0 <= free <= 2.0 + 1e-9
+    assert transform.to_value(free) == pytest.approx(1.77e9 + seconds, rel=0.0, abs=1e-6)
+
+
+@given(free=st.floats(-1e6, 0.0))
+def test_a_floored_number_rests_on_its_bound_and_can_come_back(free: float) -> None:
+    assert Floored(0.0).to_value(free) == 0.0
+    assert Floored(0.0).slope(free) == 1.0
+
+
+def test_what_moves_by_factors() -> None:
+    assert [is_logarithmic(t) for t in TRANSFORMS] == [False, True, True, False, False]

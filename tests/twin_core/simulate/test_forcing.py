@@ -1,6 +1,7 @@
 """Telemetry as forcing: what every stage of every step sees, told from the samples by hand."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -132,3 +133,21 @@ def test_a_solar_load_without_dates_is_refused() -> None:
 
 def test_without_a_solar_load_the_sun_does_not_matter() -> None:
     np.testing.assert_array_equal(build(samples()).sun_factor, 1.0)
+
+
+def test_terms_see_the_same_instant_in_records_of_other_epochs() -> None:
+    zero = np.zeros((6, 1))
+    own = build(samples()).along(zero, np.zeros((6, 2)), 0, 3)
+    late = build(Record(TIME_S, samples().values, 1_767_225_600 * NS_PER_S)).along(zero, np.zeros((6, 2)), 0, 3)
+    early = Record(TIME_S + 3600.0, samples().values, (1_767_225_600 - 3600) * NS_PER_S)
+    np.testing.assert_array_equal(late.time_s, build(early).along(zero, np.zeros((6, 2)), 0, 3).time_s)
+    np.testing.assert_allclose(late.time_s - own.time_s, 1_767_225_600.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("dated", "message"), [(True, "counts seconds"), (False, "carries dates")])
+def test_a_network_that_knows_instants_refuses_another_clock(dated: bool, message: str) -> None:
+    network = replace(build_network(load_spec(declared())), dated=dated)
+    own, other = None if dated else 0, 0 if dated else None
+    with pytest.raises(TelemetryError, match=message):
+        build_forcing(network, Record(TIME_S, samples().values, own), np.inf)
+    assert build_forcing(network, Record(TIME_S, samples().values, other), np.inf).n_steps == 3
