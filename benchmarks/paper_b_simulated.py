@@ -18,12 +18,13 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.gp.discretise import discretise
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.kernels import Kernel, Matern, Values
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.gp.smoother import smooth
 from twin_core.gp.state_space import LinearModel
 from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, Posterior, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
-from twin_core.latent_force.polynomial import ForcePolynomial, regress_pointwise
+from twin_core.latent_force.polynomial import regress_pointwise
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_force
 
@@ -129,14 +130,9 @@ class Tally:
 
 def _simulation_mse(polynomials: Sequence[ForcePolynomial]) -> float:
     """Simulate the test with the learned mean, held at its edges; return the mean squared error, K²."""
-    curves = []
-    for polynomial in polynomials:
-        settings, values = polynomial.effect_settings()
-        curves.append((settings, Polynomial(list(values.values()))))
 
     def extra(x: FloatArray) -> FloatArray:
-        heat = [c(np.clip((t - s["centre_K"]) / s["scale_K"], -1.0, 1.0)) for t, (s, c) in zip(x, curves, strict=True)]
-        return np.array(heat) / CAPACITY
+        return np.array([p.heat_W(t, AMBIENT) for t, p in zip(x, polynomials, strict=True)]) / CAPACITY
 
     return float(np.mean((simulate(25.0, 120.0, 600.0, extra) - TEST) ** 2))
 

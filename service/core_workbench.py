@@ -108,7 +108,7 @@ class CoreWorkbench:
 
         time_us = task.telemetry.epoch_us + np.rint(ahead.time_s * 1e6).astype(np.int64)
         quantiles = {q: columns(values) for q, values in ahead.quantiles_K.items()}
-        return Forecasted(time_us, columns(ahead.mean_K), quantiles)
+        return Forecasted(time_us, columns(ahead.mean_K), quantiles, ahead.notices)
 
     def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
         """Return temperatures and heat flows of the moment that the state describes."""

@@ -193,6 +193,7 @@ class Forecast(_Answer):
     time: list[Instant]
     values: dict[str, dict[str, list[float]]]
     units: dict[str, str | None]
+    notices: list[str] = []
 
 
 class Network(_Answer):

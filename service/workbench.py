@@ -115,6 +115,7 @@ class Forecasted:
     time_us: NDArray[np.int64]
     mean: dict[str, NDArray[np.float64]]
     quantiles: dict[float, dict[str, NDArray[np.float64]]]
+    notices: tuple[str, ...] = ()
 
 
 class Workbench(Protocol):

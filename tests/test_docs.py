@@ -57,7 +57,8 @@ def test_every_method(method: str) -> None:
 def test_every_effect(effect: type) -> None:
     row = re.search(rf"^\| `{effect.name}` \| (.*?) \|", DOCS["effects.md"], re.MULTILINE)  # type: ignore[attr-defined]
     assert row is not None, f"docs/effects.md lacks {effect}"
-    assert row[1] == ", ".join(effect.keys)  # type: ignore[attr-defined]
+    optional = "".join(f" (and {key})" for key in effect.optional_keys)  # type: ignore[attr-defined]
+    assert row[1] == ", ".join(effect.keys) + optional  # type: ignore[attr-defined]
 
 
 def test_no_effect_that_is_gone() -> None:

@@ -13,6 +13,7 @@ from twin_core.errors import ModelError
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
+from twin_core.simulate.extrapolation import extrapolated_variance_K2, extrapolations, in_words
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.rollout import Rollout, rollout, sensitivities
 from twin_core.telemetry import Record
@@ -33,12 +34,15 @@ class Forecast:
     mean_K : (n_times, n_sensors)
     quantiles_K
         Probability -> (n_times, n_sensors): of what the sensors will read, their noise included.
+    notices
+        Where a learned effect is used outside what it was learned from.
     """
 
     time_s: FloatArray
     sensors: tuple[str, ...]
     mean_K: FloatArray
     quantiles_K: dict[float, FloatArray]
+    notices: tuple[str, ...] = ()
 
 
 def forecast(
@@ -74,7 +78,7 @@ def forecast(
     -------
     Forecast
         The variance adds the state's, the parameters', the misfit that the calibration saw (growing with lead time
-        up to its stationary size) and the sensor's noise.
+        up to its stationary size), the sensor's noise, and what a learned heat may be outside its visited range.
 
     Raises
     ------
@@ -94,10 +98,12 @@ def forecast(
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
     read += reading_offsets_K(network, values, future.clock_s)
     wanted = np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:])
-    std = np.sqrt(_variance(model, network, forcing, path, covariance_K2, future.time_s))[wanted]
-    mean = read[wanted]
+    beyond = extrapolations(network, model.effects, forcing, path)
+    variance = _variance(model, network, forcing, path, covariance_K2, future.time_s)
+    variance += extrapolated_variance_K2(network, [b for _, b in beyond], forcing, path, network.sensor_node)
+    std, mean = np.sqrt(variance)[wanted], read[wanted]
     bands = {q: mean + norm.ppf(q) * std for q in quantiles}
-    return Forecast(future.time_s[wanted], model.spec.sensors, mean, bands)
+    return Forecast(future.time_s[wanted], model.spec.sensors, mean, bands, in_words(beyond))
 
 
 def _sampling_s(record: Record) -> float:

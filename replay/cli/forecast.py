@@ -56,7 +56,7 @@ def forecast(
     result = look_ahead(model, record, horizon, step_s=step, plan=planned)
     document = _document(result, record, model)
     _write(out, document)
-    notify(record.notices)
+    notify([*record.notices, *result.notices])
     if as_json:
         print_line(to_json(document).rstrip())
     else:
@@ -92,7 +92,8 @@ def _document(result: "Forecast", record: "Record", model: "CalibratedModel") ->
         bands = {f"q{100 * q:02.0f}": from_si(table[:, i], unit).tolist() for q, table in result.quantiles_K.items()}
         values[sensor] = {"mean": from_si(result.mean_K[:, i], unit).tolist()} | bands
     time = [record.present(t) for t in result.time_s.tolist()]
-    return {"issued": record.present(float(record.time_s[-1])), "time": time, "values": values, "units": units}
+    issued = record.present(float(record.time_s[-1]))
+    return {"issued": issued, "time": time, "values": values, "units": units, "notices": list(result.notices)}
 
 
 def _write(out: Path, document: dict[str, Any]) -> None:

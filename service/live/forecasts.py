@@ -92,4 +92,5 @@ def render(twin: Entry, active: Active, position: Position, made: Forecasted, qu
         "time": format_instants(made.time_us),
         "values": values,
         "units": {sensor: twin.units[sensor] for sensor in made.mean},
+        "notices": list(made.notices),
     }

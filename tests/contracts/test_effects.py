@@ -97,7 +97,8 @@ def declared_heat_W(effect: Effect, survey: Survey) -> np.ndarray:
 def test_its_name_is_its_key_and_it_explains_itself(kind: type[Effect]) -> None:
     assert REGISTRY[kind.name] is kind
     assert re.fullmatch(r"[a-z]+(_[a-z]+)*", kind.name)
-    assert set(kind.keys) <= WHERE_KEYS and kind.keys
+    assert set(kind.keys + kind.optional_keys) <= WHERE_KEYS and kind.keys
+    assert not set(kind.keys) & set(kind.optional_keys)
     assert "=" in kind.equation
     assert len(kind.reference) > 10
     assert kind.words
@@ -129,7 +130,7 @@ def test_every_place_can_be_built_and_has_the_declared_keys(kind: type[Effect]) 
     assert places
     keys = set()
     for where in places:
-        assert tuple(where) == kind.keys
+        assert tuple(where) in {kind.keys, kind.keys + kind.optional_keys}
         for effect in list(kind.starts(where, survey))[:1]:
             assert layout_with(effect) is not None
             keys.add(effect.place)
@@ -264,6 +265,21 @@ def test_its_label_names_it_and_its_place(kind: type[Effect]) -> None:
     moved = effect.at_parameters({p.name: 2.0 * p.value for p in effect.parameters()})
     assert all(moved.values[q.name] == 2.0 * effect.values[q.name] for q in effect.qualities())
     assert moved.place == effect.place
+
+
+@each_effect
+def test_a_law_has_no_limits_and_what_was_learned_knows_its_own(kind: type[Effect]) -> None:
+    """Far from everything visited: a named effect is silent, the fallback says where it was at home and how unsure it is."""
+    effect = active_effect(kind)
+    network = every_term_network([effect])
+    carried = effect.learned(np.eye(len(effect.qualities())))
+    assert (carried.values, carried.label) == (effect.values, effect.label)
+    along = points(network, 9)
+    far = carried.beyond(network.layout, replace(along, temperatures_K=along.temperatures_K + 1.0e3))
+    assert (far is not None) == kind.fallback
+    if far is not None:
+        assert far.outside.all() and far.std_W.shape == (9,) and (far.std_W > 0.0).all()
+        assert network.nodes[far.node] == effect.where["node"] and effect.where["node"] in far.visited
 
 
 @each_effect

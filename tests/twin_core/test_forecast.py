@@ -11,6 +11,7 @@ from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.assimilate import assimilate
 from twin_core.calibrate import calibrate
 from twin_core.calibrate.result import CalibratedModel
+from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.forecast import forecast
 from twin_core.network.spec import load_spec
@@ -90,6 +91,36 @@ def test_what_the_calibration_could_not_explain_grows_with_lead_time() -> None:
     assert (np.diff(std) > -1e-9).all()
     assert std[0] < 0.8
     np.testing.assert_allclose(std[-1], np.sqrt(1.0 + NOISE_K**2), rtol=1e-3)
+
+
+LEARNED = {"degree": 0, "vanishing": False, "low_K": (285.0,), "high_K": (291.0,), "misfit_W": 0.0}
+
+
+@pytest.mark.parametrize("covariance_W2", [(), (16.0,)])
+def test_a_learned_heat_says_where_it_was_learned_and_its_band_grows_beyond(covariance_W2: tuple[float, ...]) -> None:
+    """An integrator that leaves the range after 500 s: the deviation of the held heat, integrated by hand."""
+    heat = LearnedHeatFlow({"node": "n0"}, {"coefficients[0]": 3.0}, LEARNED | {"covariance_W2": covariance_W2})
+    model = model_of(
+        load_spec(lone_node()), {"C:n0": CAPACITY_J_PER_K}, effects=[heat], noise_K=NOISE_K, max_step_s=10.0
+    )
+    found = forecast(model, now(7.0), 2000.0, step_s=10.0, state=known_start(), quantiles=(0.95,))
+    lead = found.time_s - NOW_S
+    np.testing.assert_allclose(found.mean_K[:, 0], 290.0 + 10.0 * lead / CAPACITY_J_PER_K, rtol=1e-9)
+    away_K = np.maximum(10.0 * lead / CAPACITY_J_PER_K - 1.0, 0.0)
+    unsure_W_per_K = np.sqrt(3.0**2 + sum(covariance_W2)) / 3.0
+    lost_K = unsure_W_per_K * away_K**2 / (2.0 * 10.0)
+    std = (found.quantiles_K[0.95] - found.mean_K)[:, 0] / norm.ppf(0.95)
+    np.testing.assert_allclose(std, np.hypot(NOISE_K, lost_K), rtol=1e-3)
+    assert len(found.notices) == 1
+    assert "learned_heat_flow(n0): learned at n0 285.00 to 291.00 K; 75% of the prediction" in found.notices[0]
+
+
+def test_within_its_range_a_learned_heat_says_nothing() -> None:
+    heat = LearnedHeatFlow({"node": "n0"}, {"coefficients[0]": 3.0}, LEARNED | {"covariance_W2": ()})
+    model = model_of(load_spec(lone_node()), {"C:n0": CAPACITY_J_PER_K}, effects=[heat], noise_K=NOISE_K)
+    found = forecast(model, now(7.0), 400.0, step_s=100.0, state=known_start(), quantiles=(0.95,))
+    assert found.notices == ()
+    np.testing.assert_allclose((found.quantiles_K[0.95] - found.mean_K) / norm.ppf(0.95), NOISE_K)
 
 
 def test_the_state_is_filtered_from_the_record() -> None:

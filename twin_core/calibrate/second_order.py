@@ -185,7 +185,7 @@ def to_model(calibration: Calibration, effects: Sequence[Effect], notices: Seque
     misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
     return CalibratedModel(
         spec,
-        tuple(effect.at_parameters(values) for effect in effects),
+        tuple(_carrying(effect.at_parameters(values), network.parameters.free_names, free) for effect in effects),
         values,
         free,
         network.parameters.free_names,
@@ -196,6 +196,12 @@ def to_model(calibration: Calibration, effects: Sequence[Effect], notices: Seque
         dict(network.layout.table_knots),
         _summary(calibration, free, notices),
     )
+
+
+def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray) -> Effect:
+    """Return an effect with the covariance of its own parameters."""
+    own = [free_names.index(p.name) for p in effect.parameters()]
+    return effect.learned(covariance[np.ix_(own, own)])
 
 
 def _summary(calibration: Calibration, covariance: FloatArray, notices: Sequence[str]) -> Json:

@@ -11,6 +11,7 @@ from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import TelemetryError
 from twin_core.network.dynamics import reading_offsets_K
+from twin_core.simulate.extrapolation import extrapolations, in_words
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -100,11 +101,15 @@ def split_burn_in(record: Record, burn_in_s: float | None) -> HeldOut:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Measured and predicted readings of one hold-out stretch, (n_samples, n_sensors) in K; the start is left out."""
+    """Measured and predicted readings of one hold-out stretch, (n_samples, n_sensors) in K; the start is left out.
+
+    ``notices`` tell where a learned effect is used outside what it was learned from.
+    """
 
     time_s: FloatArray
     measured_K: FloatArray
     predicted_K: FloatArray
+    notices: tuple[str, ...] = ()
 
 
 def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
@@ -117,4 +122,5 @@ def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
     read += reading_offsets_K(network, values, held.scored.clock_s)
     measured = measured_temperatures(model.spec, held.scored)
-    return Prediction(held.scored.time_s[1:], measured[1:], read[1:])
+    notices = in_words(extrapolations(network, model.effects, forcing, path))
+    return Prediction(held.scored.time_s[1:], measured[1:], read[1:], notices)

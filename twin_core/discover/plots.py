@@ -10,7 +10,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.search import Search
 from twin_core.discover.witness import NodeHeat, Witness
-from twin_core.latent_force.polynomial import ForcePolynomial
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.telemetry import Record
 
 MAX_POINTS = 1600

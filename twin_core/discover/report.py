@@ -161,5 +161,5 @@ def build_report(
             for judged in best_rejected(search)[:8]
         ],
         "words": after.summary["words"],
-        "notices": before.summary["notices"],
+        "notices": [*before.summary["notices"], *(notice for p in predictions[1] for notice in p.notices)],
     }

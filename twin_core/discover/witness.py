@@ -16,9 +16,9 @@ from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
 from twin_core.discover.search import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
-from twin_core.latent_force.polynomial import ForcePolynomial
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_extended
 from twin_core.network.dynamics import fill_boundaries, reading_offsets_K

@@ -53,7 +53,7 @@ def effect_from_json(data: Any, position: int = 0) -> Effect:
         if not isinstance(given, dict):
             raise SpecError(f"{field}.{part}: must be a mapping")
     try:
-        require(parts["where"], kind.keys, kind.name)
+        require(parts["where"], kind)
         settings = {k: tuple(v) if isinstance(v, list) else v for k, v in parts["settings"].items()}
         effect = kind(dict(parts["where"]), {k: float(v) for k, v in parts["values"].items()}, settings)
         lacking = [q.name for q in effect.qualities() if q.name not in effect.values]

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from twin_core._typing import FloatArray, Json
+from twin_core._typing import BoolArray, FloatArray, Json
 from twin_core.errors import ModelError
 from twin_core.network.model import Addition, ExtraNode, Layout
 from twin_core.network.terms import Along, ReadingTerm, Term
@@ -90,6 +90,27 @@ class Survey:
 
 
 @dataclass(frozen=True)
+class Beyond:
+    """Points at which an effect is used outside what it was learned from.
+
+    Attributes
+    ----------
+    node
+        Position of the node that receives its heat.
+    outside : (n_points,)
+    std_W : (n_points,)
+        Standard deviation that its heat has for this alone; zero inside.
+    visited
+        What it was learned from, in words: ``px 280.00 to 295.00 K``.
+    """
+
+    node: int
+    outside: BoolArray
+    std_W: FloatArray
+    visited: str
+
+
+@dataclass(frozen=True)
 class Effect(ABC):
     """A missing-physics term at a place, with values.
 
@@ -109,6 +130,8 @@ class Effect(ABC):
 
     name: ClassVar[str]
     keys: ClassVar[tuple[str, ...]]
+    optional_keys: ClassVar[tuple[str, ...]] = ()
+    """Keys of ``where`` that may follow."""
     equation: ClassVar[str]
     reference: ClassVar[str]
     words: ClassVar[str]
@@ -138,6 +161,14 @@ class Effect(ABC):
     def extra_nodes(self, layout: Layout) -> tuple[ExtraNode, ...]:
         """Return the states that the effect adds; none for most."""
         return ()
+
+    def learned(self, covariance: FloatArray) -> Self:
+        """Return the effect with the covariance of its parameters in the solver's coordinate, where it carries it."""
+        return self
+
+    def beyond(self, layout: Layout, along: Along) -> Beyond | None:
+        """Return where the effect is used outside what it was learned from; None where it is not, or is a law."""
+        return None
 
     @property
     def label(self) -> str:
@@ -227,20 +258,20 @@ class Effect(ABC):
         return np.array([null[p.name] for p in term.parameters] + [survey.parameters[name] for name in term.borrows])
 
 
-def require(where: Where, keys: tuple[str, ...], effect: str) -> None:
-    """Raise ModelError unless ``where`` has just these keys, with names as values and a pair under ``nodes``."""
-    for key in keys:
+def require(where: Where, kind: type[Effect]) -> None:
+    """Raise ModelError unless ``where`` has the keys of an effect, with names as values and a pair under ``nodes``."""
+    effect, known = kind.name, (*kind.keys, *kind.optional_keys)
+    for key in kind.keys:
         if key not in where:
             raise ModelError(f"effect {effect}: where.{key} is missing")
-        value = where[key]
+    for key, value in where.items():
+        if key not in known:
+            raise ModelError(f"effect {effect}: where.{key} is not one of {', '.join(known)}")
         pair = isinstance(value, list | tuple) and len(value) == 2 and all(isinstance(v, str) for v in value)
         if (key == "nodes" and not pair) or (key != "nodes" and not isinstance(value, str)):
             raise ModelError(
                 f"effect {effect}: where.{key} must be {'a pair of nodes' if key == 'nodes' else 'a name'}"
             )
-    for key in where:
-        if key not in keys:
-            raise ModelError(f"effect {effect}: where.{key} is not one of {', '.join(keys)}")
 
 
 def to_json(effect: Effect) -> Json:

@@ -1,13 +1,15 @@
 """The honest fallback: a repeatable heat flow without a name, as a polynomial of temperature."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Beyond, Effect, Quality, Survey, Where
+from twin_core.errors import ModelError
+from twin_core.gp.polynomial import SMALLEST_SCALE_K, Basis, ForcePolynomial
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
@@ -17,60 +19,125 @@ MAX_DEGREE = 3
 
 @dataclass(frozen=True)
 class PolynomialHeat:
-    """q = sum_k c_k x^k with x = (T - centre) / scale, held at its edge value outside the visited range."""
+    """The heat of a basis and its coefficients, held at its edge value outside the visited range."""
 
     node: int
-    centre_K: float
-    scale_K: float
-    reach: float
+    boundary: int | None
+    basis: Basis
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
-        """Evaluate the polynomial; beyond ``reach`` in x the heat stays what it was at the edge."""
-        raw = (along.temperatures_K[:, self.node] - self.centre_K) / self.scale_K
-        x = np.clip(raw, -self.reach, self.reach)
-        powers = x[:, None] ** np.arange(values.size)
-        orders = np.arange(1, values.size)
-        slope = (powers[:, :-1] * orders) @ values[1:] if values.size > 1 else np.zeros_like(x)
-        slope = np.where(np.abs(raw) < self.reach, slope / self.scale_K, 0.0)
-        entries = [Entry(k, self.node, powers[:, k]) for k in range(values.size)]
-        return Heat((self.node,), (powers @ values)[:, None], slope[:, None, None], entries)
+        """Evaluate the polynomial; where x or z lies outside its range the heat does not answer to it."""
+        raw = self.basis.scaled(*_at(along, self.node, self.boundary))
+        held = self.basis.held(raw)
+        terms, slopes = self.basis.at_scaled(held), self.basis.slopes(held) @ values
+        by_x, by_z = np.where(raw == held, slopes, 0.0) / self.basis.scale_K[:, None]
+        entries = [Entry(k, self.node, terms[:, k]) for k in range(values.size)]
+        ends = []
+        if self.boundary is not None:
+            ends = [Entry(self.boundary, self.node, by_z - by_x if self.basis.vanishing else by_z)]
+        return Heat((self.node,), (terms @ values)[:, None], by_x[:, None, None], entries, ends)
 
 
 class LearnedHeatFlow(Effect):
-    """q = Bayesian polynomial of T, from the latent force (paper B, eqs. 33-41)."""
+    """q = Bayesian polynomial of T (and T_s), from the latent force (paper B, eqs. 33-41).
+
+    Its settings are the degree, the form, the visited range and, once fitted, the covariance of the coefficients: where a
+    rollout leaves the range it says so, and its band grows.
+    """
 
     name = "learned_heat_flow"
     keys = ("node",)
-    equation = "q = sum_k c_k ((T - T_c) / T_w)^k"
+    optional_keys = ("boundary",)
+    equation = "q = sum_k c_k x^a_k z^b_k, x = (T - T_c) / T_w or (T - T_s) / T_w, z = (T_s - T_sc) / T_sw"
     reference = "Kouw et al., CCTA 2024, section III-C"
     words = "receives a heat that repeats with its temperature but fits no named effect"
     reported_settings = ("degree",)
     fallback = True
 
+    @property
+    def basis(self) -> Basis:
+        """Its terms and their range; ModelError where a setting is not what it must be."""
+        s = self.settings
+        try:
+            low, high = tuple(map(float, s["low_K"])), tuple(map(float, s["high_K"]))
+            basis = Basis(int(s["degree"]), bool(s["vanishing"]), low, high)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"{self.label}: a setting is no number ({error})") from error
+        if basis.has_boundary != ("boundary" in self.where):
+            raise ModelError(f"{self.label}: low_K holds {len(low)} temperatures, where has {', '.join(self.where)}")
+        return basis
+
     def qualities(self) -> tuple[Quality, ...]:
         """Return the coefficients, in W."""
-        return tuple(Quality(f"coefficients[{k}]", "W", null=0.0) for k in range(int(self.settings["degree"]) + 1))
+        return tuple(Quality(f"coefficients[{k}]", "W", null=0.0) for k in range(len(self.basis.exponents)))
 
     def addition(self, layout: Layout) -> Addition:
         """Return the polynomial."""
-        s = self.settings
-        node = layout.node(self.where["node"])
-        return Addition((PolynomialHeat(node, s["centre_K"], s["scale_K"], s["reach"], self.parameters()),))
+        return Addition((PolynomialHeat(*self._place(layout), self.basis, self.parameters()),))
+
+    def learned(self, covariance: FloatArray) -> Self:
+        """Return the effect carrying the covariance of its coefficients, in W²."""
+        return replace(self, settings={**self.settings, "covariance_W2": tuple(covariance.ravel().tolist())})
+
+    def beyond(self, layout: Layout, along: Along) -> Beyond | None:
+        """Return where temperatures leave the visited range and how uncertain the heat is there."""
+        node, boundary = self._place(layout)
+        law = ForcePolynomial(
+            self.basis,
+            np.array([self.values[q.name] for q in self.qualities()]),
+            self._covariance(),
+            float(self.settings["misfit_W"]),
+        )
+        found = law.predict(*_at(along, node, boundary))
+        if not found.outside.any():
+            return None
+        about = [self.where[key] for key in ("node", "boundary") if key in self.where]
+        if law.basis.vanishing:
+            about[0] = " - ".join(about)
+        ranges = zip(about, law.basis.low_K, law.basis.high_K, strict=True)
+        return Beyond(
+            node,
+            found.outside,
+            found.beyond_W,
+            " and ".join(f"{n} {low:.2f} to {high:.2f} K" for n, low, high in ranges),
+        )
+
+    def _place(self, layout: Layout) -> tuple[int, int | None]:
+        boundary = self.where.get("boundary")
+        return layout.node(self.where["node"]), None if boundary is None else layout.boundary(boundary)
+
+    def _covariance(self) -> FloatArray:
+        size = len(self.basis.exponents)
+        given = np.array(self.settings["covariance_W2"], dtype=np.float64)
+        if given.size not in (0, size**2) or not np.isfinite(given).all():
+            raise ModelError(f"{self.label}: covariance_W2 must hold {size} x {size} numbers, or none")
+        return given.reshape(size, size) if given.size else np.zeros((size, size))
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:
-        """Yield every node."""
-        yield from ({"node": node} for node in layout.declared_nodes)
+        """Yield every node, alone and with every boundary."""
+        for node in layout.declared_nodes:
+            yield {"node": node}
+            yield from ({"node": node, "boundary": boundary} for boundary in layout.boundaries)
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
-        """Yield polynomials of rising degree, centred and scaled on the visited range."""
-        temperature = survey.temperature_K(where["node"])
-        centre, scale = float(temperature.mean()), float(max(temperature.std(), 1e-3))
-        reach = float(np.abs((temperature - centre) / scale).max())
-        for degree in range(1, MAX_DEGREE + 1):
-            values = {f"coefficients[{k}]": 0.0 for k in range(degree + 1)}
-            settings = {"degree": degree, "centre_K": centre, "scale_K": scale, "reach": reach}
-            yield cls(where, values, settings)
+        """Yield polynomials of rising degree over the visited range; with a boundary only where it has moved."""
+        temperature, boundary = survey.temperature_K(where["node"]), None
+        forms = [False]
+        if "boundary" in where:
+            boundary = survey.along.boundaries_K[:, survey.layout.boundary(where["boundary"])]
+            forms = [False, True] if np.ptp(boundary) > 2.0 * SMALLEST_SCALE_K else []
+        for vanishing in forms:
+            for degree in range(1, MAX_DEGREE + 1):
+                basis = Basis.over(degree, temperature, boundary, vanishing=vanishing)
+                none = np.zeros(len(basis.exponents))
+                settings, values = ForcePolynomial(basis, none, np.zeros((0, 0))).effect_settings()
+                yield cls(where, values, settings)
+
+
+def _at(along: Along, node: int, boundary: int | None) -> tuple[FloatArray, FloatArray | None]:
+    """Return the temperatures of the node and, if any, of the boundary, (n_points,)."""
+    return along.temperatures_K[:, node], None if boundary is None else along.boundaries_K[:, boundary]

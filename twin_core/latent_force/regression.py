@@ -17,8 +17,8 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
 from twin_core.gp.columns import WhiteRegression, whiten_responses
 from twin_core.gp.discretise import discretise
+from twin_core.gp.polynomial import Basis, ForcePolynomial
 from twin_core.latent_force.model import Force, ForceModel, augment, drive, step_table
-from twin_core.latent_force.polynomial import Basis, ForcePolynomial
 from twin_core.latent_force.smooth import LatentForce
 
 MISFIT_SHARES = (1e-4, 1e-2, 3e-2, 0.1, 0.3, 1.0)
@@ -163,7 +163,7 @@ def _learn(
     degrees = family.choose(allowed.degrees)
     choice = family.solve(degrees)
     return LearnedHeatFlow(
-        tuple(_polynomial(k, basis, choice, problems[0].owner) for k, basis in enumerate(bases)),
+        tuple(_polynomial(k, basis, degrees[k], choice, problems[0].owner) for k, basis in enumerate(bases)),
         degrees,
         choice.misfit_W,
         choice.log_evidence,
@@ -303,9 +303,9 @@ class _Family:
         return _Choice(each[0].kept, mean, cov, total, misfit)
 
 
-def _polynomial(k: int, basis: Basis, choice: _Choice, owner: IntArray) -> ForcePolynomial:
+def _polynomial(k: int, basis: Basis, degree: int, choice: _Choice, owner: IntArray) -> ForcePolynomial:
     """Cut one force out of the joint posterior."""
     own = np.flatnonzero(owner[choice.kept] == k)
-    short = replace(basis, exponents=tuple(basis.exponents[: own.size]))
+    short = replace(basis, degree=degree)
     cov = choice.cov[np.ix_(own, own)]
     return ForcePolynomial(short, choice.mean[own], cov, float(choice.misfit_W[k]), choice.log_evidence)

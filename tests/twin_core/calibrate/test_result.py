@@ -128,7 +128,7 @@ def test_a_damaged_model_file_is_named(change: Callable[[dict[str, Any]], Any], 
 
 def test_a_missing_setting_is_named() -> None:
     data = every_model("learned_heat_flow").to_json()
-    for setting in ("degree", "centre_K"):
+    for setting in ("degree", "low_K"):
         damaged = copy.deepcopy(data)
         del damaged["effects"][0]["settings"][setting]
         with pytest.raises(SpecError, match=setting):

@@ -111,13 +111,14 @@ def check_report(report: dict[str, Any], case: Case) -> None:
 
 def check_finding(finding: dict[str, Any]) -> None:
     kind = REGISTRY[finding["effect"]]
-    assert tuple(finding["where"]) == kind.keys
+    assert tuple(finding["where"]) in {kind.keys, kind.keys + kind.optional_keys}
     assert finding["parameters"] and finding["evidence"]["log_bayes_factor"] > 0.0
     assert 0.0 <= finding["evidence"]["p_value"] <= 1.0
     for row in finding["parameters"].values():
         assert set(row) == {"mean", "std"}
     for other in finding["alternatives"]:
-        assert tuple(other["where"]) == REGISTRY[other["effect"]].keys
+        rival = REGISTRY[other["effect"]]
+        assert tuple(other["where"]) in {rival.keys, rival.keys + rival.optional_keys}
         assert other["log_bayes_factor"] >= finding["evidence"]["log_bayes_factor"] - 3.0 - 1e-9
         assert (other["effect"], other["where"]) != (finding["effect"], finding["where"])
 

@@ -1,6 +1,7 @@
 """Effects that are a heat flow: the heat by hand, and where they may stand."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from tests.analytic import SIGMA
 from tests.helpers import every_term_network, points, survey_of
 from twin_core.effects import REGISTRY, Effect
+from twin_core.errors import ModelError
 from twin_core.network.terms import Along
 
 ALONG = Along(
@@ -98,12 +100,69 @@ def test_input_power_law_of_a_percentage_keeps_its_gain() -> None:
     np.testing.assert_allclose(found[:, 2], 0.4 * (np.array([25.0, 0.0, 1.0]) - [50.0, 0.0, 10.0]), atol=1e-9)
 
 
+LEARNED = {
+    "degree": 2, "vanishing": False, "low_K": (275.0,), "high_K": (305.0,), "misfit_W": 0.0, "covariance_W2": (),
+}  # fmt: skip
+
+
 def test_learned_heat_flow_is_held_beyond_what_it_has_seen() -> None:
     values = {"coefficients[0]": 1.0, "coefficients[1]": 2.0, "coefficients[2]": 3.0}
-    settings = {"degree": 2, "centre_K": 290.0, "scale_K": 10.0, "reach": 1.5}
-    found = heat_W(REGISTRY["learned_heat_flow"]({"node": "a"}, values, settings))[:, 0]
-    x = np.array([1.0, 1.5, -1.5])
+    found = heat_W(REGISTRY["learned_heat_flow"]({"node": "a"}, values, LEARNED))[:, 0]
+    x = np.array([2.0 / 3.0, 1.0, -1.0])
     np.testing.assert_allclose(found, 1.0 + 2.0 * x + 3.0 * x**2)
+
+
+@pytest.mark.parametrize("vanishing", [False, True])
+def test_learned_heat_flow_answers_to_node_and_boundary(vanishing: bool) -> None:
+    """Heat and slopes against the polynomial written out; beyond the range neither temperature moves it."""
+    low_K, high_K = ((-20.0, 290.0), (20.0, 300.0)) if vanishing else ((280.0, 290.0), (310.0, 300.0))
+    settings = LEARNED | {"vanishing": vanishing, "low_K": low_K, "high_K": high_K}
+    c = [0.5, 2.0, -3.0, 1.0, 0.7, -0.2][: 3 if vanishing else 6]
+    values = {f"coefficients[{k}]": v for k, v in enumerate(c)}
+    effect = REGISTRY["learned_heat_flow"]({"node": "a", "boundary": "room"}, values, settings)
+    term = effect.addition(every_term_network([effect]).layout).terms[0]
+
+    def by_hand(t: np.ndarray, b: np.ndarray) -> np.ndarray:
+        if vanishing:
+            x, z = np.clip(t - b, -20.0, 20.0) / 20.0, (np.clip(b, 290.0, 300.0) - 295.0) / 5.0
+            return c[0] * x + c[1] * x**2 + c[2] * x * z
+        x, z = (np.clip(t, 280.0, 310.0) - 295.0) / 15.0, (np.clip(b, 290.0, 300.0) - 295.0) / 5.0
+        return c[0] + c[1] * x + c[2] * z + c[3] * x**2 + c[4] * x * z + c[5] * z**2
+
+    t, b = np.array([300.0, 285.0, 330.0, 292.0]), np.array([295.0, 292.0, 294.0, 320.0])
+    nodes, ends = np.tile(t[:, None], 3), np.tile(b[:, None], 3)
+    part = term.evaluate(Along(np.arange(4.0), nodes, ends, {}, np.ones(4)), np.array(c))
+    np.testing.assert_allclose(part.heat_W[:, 0], by_hand(t, b), rtol=1e-12)
+    step = 1e-5
+    by_t, by_b = by_hand(t + step, b) - by_hand(t - step, b), by_hand(t, b + step) - by_hand(t, b - step)
+    np.testing.assert_allclose(part.d_temperature[:, 0, 0], by_t / (2 * step), atol=1e-7)
+    assert [(e.item, e.node) for e in part.d_boundaries] == [(1, 0)]
+    np.testing.assert_allclose(part.d_boundaries[0].series, by_b / (2 * step), atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("where", "change", "message"),
+    [
+        ({"node": "a", "boundary": "room"}, {}, "low_K holds 1 temperatures, where has node, boundary"),
+        ({"node": "a"}, {"low_K": (280.0, 1.0), "high_K": (290.0, 2.0)}, "low_K holds 2 temperatures, where has node"),
+        ({"node": "a"}, {"low_K": 3.0}, "a setting is no number"),
+        ({"node": "a"}, {"low_K": (310.0,)}, "low_K not above high_K"),
+        ({"node": "a"}, {"degree": -1}, "degree must be at least 0"),
+    ],
+)
+def test_learned_heat_flow_with_wrong_settings_is_refused(where: dict, change: dict, message: str) -> None:
+    effect = REGISTRY["learned_heat_flow"](where, {"coefficients[0]": 0.0}, LEARNED | change)
+    with pytest.raises(ModelError, match=message):
+        effect.qualities()
+
+
+def test_learned_heat_flow_tries_a_boundary_only_where_it_has_moved() -> None:
+    network = every_term_network()
+    kind, along = REGISTRY["learned_heat_flow"], points(network, 60)
+    still = replace(along, boundaries_K=np.full_like(along.boundaries_K, 290.0))
+    where = {"node": "a", "boundary": "room"}
+    assert [len(list(kind.starts(where, survey_of(network, a)))) for a in (along, still)] == [6, 0]
+    assert len(list(kind.starts({"node": "a"}, survey_of(network, still)))) == 3
 
 
 def places(name: str) -> list[dict]:

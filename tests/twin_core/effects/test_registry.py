@@ -35,6 +35,19 @@ def test_damage_is_named(data: Any, message: str) -> None:
         effect_from_json(data, 3)
 
 
+def test_an_optional_key_may_follow() -> None:
+    settings = {"degree": 0, "vanishing": False, "low_K": [280.0, 290.0], "high_K": [300.0, 295.0]}
+    data = {
+        "effect": "learned_heat_flow",
+        "where": {"node": "a", "boundary": "room"},
+        "settings": settings | {"misfit_W": 0.0, "covariance_W2": []},
+        "values": {f"coefficients[{k}]": 1.0 for k in range(1)},
+    }
+    assert effect_from_json(data).label == "learned_heat_flow(a,room)"
+    with pytest.raises(SpecError, match=r"where\.sink is not one of node, boundary"):
+        effect_from_json(data | {"where": {"node": "a", "sink": "room"}})
+
+
 def test_an_intact_effect_is_read() -> None:
     effect = effect_from_json(GOOD)
     assert isinstance(effect, REGISTRY["leak_to_boundary"])

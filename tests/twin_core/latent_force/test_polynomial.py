@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
-from numpy.polynomial import Polynomial
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from twin_core.errors import ModelError
-from twin_core.latent_force.polynomial import Basis, ForcePolynomial, regress_pointwise
+from twin_core.gp.polynomial import Basis, ForcePolynomial
+from twin_core.latent_force.polynomial import regress_pointwise
 
 T = np.linspace(290.0, 330.0, 41)
 
@@ -35,7 +38,6 @@ def test_outside_the_range_the_mean_is_held_and_the_band_grows():
     assert not inside.outside.any()
     np.testing.assert_array_equal(outside.outside, [False, True, True, True, True])
     np.testing.assert_allclose(outside.mean_W[:4], _heat(330.0), rtol=1e-6)
-    assert (np.diff(outside.std_W[:4]) > 0).all()
     # The band takes in what the polynomial itself would have said.
     assert (np.abs(outside.mean_W - _heat(np.array([330.0, 331.0, 335.0, 350.0, 280.0]))) <= outside.std_W).all()
 
@@ -48,8 +50,8 @@ def test_boundary_is_a_second_variable():
     assert len(found.basis.exponents) == 6
     np.testing.assert_allclose(found.predict(T, boundary).mean_W, heat, atol=1e-8)
     assert found.predict(np.array(310.0), np.array(300.0)).outside
-    with pytest.raises(ModelError, match="own temperature"):
-        found.effect_settings()
+    with pytest.raises(ModelError, match="boundary_K is missing"):
+        found.predict(T)
 
 
 def test_vanishing_basis_has_no_heat_without_difference():
@@ -63,18 +65,55 @@ def test_vanishing_basis_has_no_heat_without_difference():
     np.testing.assert_allclose(moved.mean_W, -0.5 * (T - 280.0) ** 2, atol=1e-8)
 
 
-@pytest.mark.parametrize("vanishing", [False, True])
-def test_the_effect_is_the_same_polynomial(vanishing):
-    """c_k ((T - centre) / scale)^k with |x| <= reach = 1 over the visited range."""
-    found = regress_pointwise(
-        T, _heat(T), np.full(41, 0.1), degree=3, boundary_K=np.full(41, 275.0), vanishing=vanishing
-    )
-    settings, values = found.effect_settings()
-    x = (T - settings["centre_K"]) / settings["scale_K"]
-    assert (settings["degree"], settings["reach"]) == (3, 1.0)
-    assert x.min() == pytest.approx(-1.0) and x.max() == pytest.approx(1.0)
-    curve = Polynomial([values[f"coefficients[{k}]"] for k in range(4)])
-    np.testing.assert_allclose(curve(x), found.predict(T).mean_W, atol=1e-8)
+WEIGHTS = arrays(np.float64, 21, elements=st.floats(-10.0, 10.0))
+
+
+@given(WEIGHTS, st.integers(0, 5), st.booleans(), st.integers(0, 3), st.floats(0.0, 2.0))
+@settings(max_examples=60, deadline=None)
+def test_the_band_never_falls_outside_whatever_the_polynomial(weights, degree, vanishing, form, misfit_W):
+    """By construction: every degree, every form, on either side, of the node and of the boundary."""
+    boundary = (None, np.full(41, 275.0), np.linspace(270.0, 280.0, 41), np.linspace(280.0, 270.0, 41))[form]
+    vanishing, degree = vanishing and form > 0, max(degree, 1)
+    basis = Basis.over(degree, T, boundary, vanishing=vanishing)
+    n = len(basis.exponents)
+    law = ForcePolynomial(basis, weights[:n], np.outer(weights[-n:], weights[-n:]) + 1e-3 * np.eye(n), misfit_W)
+    at_edge = None if boundary is None else 275.0
+    far = np.array([0.0, 1e-3, 0.1, 0.5, 1.0, 2.0, 5.0, 20.0, 100.0])
+    edges = np.array([basis.low_K[0], basis.high_K[0]]) + (275.0 if vanishing else 0.0)
+    walks = [(edges[0] - far, at_edge), (edges[1] + far, at_edge)]
+    if boundary is not None and not vanishing:
+        walks += [(310.0, basis.high_K[1] + far), (310.0, basis.low_K[1] - far)]
+    for t, b in walks:
+        band = law.predict(t, b)
+        assert (np.diff(band.std_W) > 0.0).all() and (np.diff(band.beyond_W) > 0.0).all()
+        raw = basis.at_scaled(basis.scaled(t, b)) @ law.mean_W
+        assert (np.abs(raw - band.mean_W) <= band.std_W * (1.0 + 1e-9)).all()
+
+
+def test_a_constant_heat_grows_too():
+    """Degree nought: one half-range away the heat may be nothing or twice itself."""
+    law = ForcePolynomial(Basis.over(0, T), np.array([3.0]), np.array([[16.0]]))
+    band = law.predict(np.array([330.0, 350.0, 370.0, 270.0]))
+    np.testing.assert_allclose(band.beyond_W, [0.0, 5.0, 10.0, 5.0])
+    np.testing.assert_allclose(band.std_W, np.hypot(4.0, [0.0, 5.0, 10.0, 5.0]))
+
+
+def test_taylor_coefficients_are_the_binomials():
+    """The terms at a point apart, from the coefficients at another, in two variables."""
+    basis = Basis.over(4, T, np.linspace(270.0, 280.0, 41))
+    at, step = np.array([[0.3, -1.0], [0.7, 0.2]]), np.array([0.4, -1.3])
+    powers = step[0] ** np.arange(5)[:, None] * step[1] ** np.arange(5)
+    moved = np.einsum("nkij,ij->nk", basis.taylor(at), powers)
+    np.testing.assert_allclose(moved, basis.at_scaled(at + step[:, None]), rtol=1e-12)
+
+
+def test_a_boundary_that_stood_still_is_told_once_it_moves():
+    law = regress_pointwise(T, _heat(T), np.full(41, 0.1), degree=3, boundary_K=np.full(41, 275.0))
+    assert not law.predict(T, np.full(41, 275.0)).outside.any()
+    near, far = law.predict(np.array(310.0), np.array(276.0)), law.predict(np.array(310.0), np.array(285.0))
+    assert near.outside and near.mean_W == far.mean_W and near.std_W < far.std_W
+    alone = regress_pointwise(T, _heat(T), np.full(41, 0.1), degree=3)
+    assert not alone.predict(T, np.full(41, 150.0)).outside.any(), "a boundary that takes no part was looked at"
 
 
 def test_uncertain_temperature_is_averaged():
@@ -99,6 +138,13 @@ def test_a_node_that_does_not_move_has_a_constant_heat():
         (lambda: Basis.over(2, T, vanishing=True), "needs the boundary temperature"),
         (lambda: Basis.over(2, np.array([np.nan])), "finite temperatures"),
         (lambda: regress_pointwise(T, T, 0.0 * T, degree=1), "no variance"),
+        (lambda: regress_pointwise(T, T, T[:3], degree=1), "one shape"),
+        (lambda: regress_pointwise(T, T, -T, degree=1), "not negative"),
+        (lambda: regress_pointwise(T, T * np.nan, T, degree=1), "must be finite"),
+        (lambda: regress_pointwise(T, T, T, degree=1, prior_std_W=0.0), "prior_std_W must be positive"),
+        (lambda: Basis(1, False, (290.0,), (280.0,)), "low_K not above high_K"),
+        (lambda: Basis(1, True, (290.0,), (300.0,)), "two where a boundary takes part"),
+        (lambda: Basis(1, False, (290.0, 3.0), (300.0,)), "one temperature each"),
     ],
 )
 def test_bad_input_is_told(call, words):

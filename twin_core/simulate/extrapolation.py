@@ -1,0 +1,67 @@
+"""Rollouts that leave what an effect was learned from: they say so, and their band grows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.effects.base import Beyond, Effect
+from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.model import Network
+from twin_core.simulate.forcing import Forcing
+from twin_core.simulate.kernels import GAMMA, march_sensitivities
+from twin_core.simulate.rollout import Rollout, balance_along
+
+
+def extrapolations(
+    network: Network, effects: Sequence[Effect], forcing: Forcing, path: Rollout
+) -> list[tuple[Effect, Beyond]]:
+    """Return the effects that a rollout uses outside what they were learned from, and where.
+
+    Parameters
+    ----------
+    network, forcing, path
+        A converged rollout.
+    effects
+        Those of the network, at its values.
+    """
+    n_steps, n_nodes = forcing.n_steps, len(network.nodes)
+    boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(0, n_steps))
+    along = forcing.along(path.stages_K.reshape(-1, n_nodes), boundaries, 0, n_steps)
+    found = [(effect, effect.beyond(network.layout, along)) for effect in effects]
+    return [(effect, beyond) for effect, beyond in found if beyond is not None]
+
+
+def extrapolated_variance_K2(
+    network: Network, beyond: Sequence[Beyond], forcing: Forcing, path: Rollout, observed: IntArray
+) -> FloatArray:
+    """Return the variance that heats of unknown size add to the observed states, (n_samples, n_observed).
+
+    What a curve gets wrong it gets wrong all along: the error of each effect is one number times its standard deviation.
+    """
+    if not beyond:
+        return np.zeros((forcing.sample_step.size, observed.size))
+    n_nodes = len(network.nodes)
+    balance = balance_along(network, network.parameters.values, forcing, path.stages_K, 0, forcing.n_steps)
+    rates = [one.std_W / balance.capacity_J_per_K[:, one.node] for one in beyond]
+    response, _ = march_sensitivities(
+        forcing.step_s,
+        balance.jacobian_per_s.reshape(-1, 2, n_nodes, n_nodes),
+        np.arange(len(beyond), dtype=np.int64),
+        np.array([one.node for one in beyond], dtype=np.int64),
+        np.array(rates).reshape(len(beyond), forcing.n_steps, 2),
+        np.zeros((n_nodes, len(beyond))),
+        forcing.sample_step,
+        observed,
+        GAMMA,
+    )
+    return np.asarray((response**2).sum(axis=-1))
+
+
+def in_words(found: Sequence[tuple[Effect, Beyond]]) -> tuple[str, ...]:
+    """Return one sentence per effect that was used outside what it was learned from."""
+    return tuple(
+        f"{effect.label}: learned at {beyond.visited}; {beyond.outside.mean():.0%} of the prediction lies outside, where "
+        "its heat is held and the band is widened"
+        for effect, beyond in found
+    )
