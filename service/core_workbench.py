@@ -173,9 +173,13 @@ def _outcome(model: Any, validation: Json, rival_rmse_K: float | None) -> Outcom
     summary = dict(model.summary)
     train = summary.pop("train", {})
     extra = {"parameters": summary.get("parameters", []), "notices": summary.get("notices", []), "fit": summary}
-    return Outcome(document, train, validation, [_wire(e) for e in document["effects"]], rival_rmse_K, extra=extra)
+    return Outcome(document, train, validation, [_wire(e) for e in model.effects], rival_rmse_K, extra=extra)
 
 
-def _wire(effect: Json) -> Json:
-    """Return an effect of a model file as clients see it."""
-    return {"effect": effect["effect"], "where": effect["where"], "parameters": effect["values"]}
+def _wire(effect: Any) -> Json:
+    """Return an effect of a model as clients see it."""
+    from twin_core.effects import effect_to_json
+
+    data = effect_to_json(effect)
+    values = {quality.name: effect.presented(quality) for quality in effect.qualities()}
+    return {"effect": data["effect"], "where": data["where"], "parameters": values}

@@ -17,6 +17,7 @@ _UNITS = {
     "_K": "K",
     "_J": "J",
     "_s": "s",
+    "time": "s",
 }
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DECISIVE, STRONG = 5.0, 3.0
@@ -103,9 +104,11 @@ def number(value: Any, digits: int = 3) -> str:
 
 
 def with_spread(mean: Any, std: Any) -> str:
-    """Return ``mean ± std``, both cut where the spread makes further digits meaningless."""
+    """Return ``mean ± std``, both cut where the spread makes further digits meaningless; a date stays as it is."""
+    if isinstance(mean, str):
+        return f"{mean} ± {number(std, 2)}" if std else mean
     if not isinstance(mean, int | float):
-        return str(mean) if isinstance(mean, str) else "–"
+        return "–"
     if not isinstance(std, int | float) or not math.isfinite(std) or std <= 0:
         return number(mean, 4)
     decimals = 1 - math.floor(math.log10(std))
@@ -121,8 +124,9 @@ def parameters(finding: Mapping[str, Any]) -> list[Json]:
     rows = []
     for name, value in (finding.get("parameters") or {}).items():
         suffix = next((end for end in _UNITS if name.endswith(end)), "")
-        symbol, unit = name.removesuffix(suffix) or name, _UNITS.get(suffix, "")
         mean, std = value.get("mean"), value.get("std")
+        symbol, unit = name.removesuffix(suffix) or name, _UNITS.get(suffix, "")
+        unit = "" if isinstance(mean, str) and not std else unit
         if isinstance(mean, list):
             stds = std if isinstance(std, list) else [None] * len(mean)
             text = "; ".join(with_spread(m, s) for m, s in zip(mean, stds, strict=False))

@@ -21,10 +21,10 @@ def where_json(effect: Effect) -> Json:
 
 
 def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
-    """Return mean and standard deviation of an effect's parameters; tables and coefficients become lists."""
+    """Return mean and standard deviation of an effect's parameters; tables become lists, instants their own form."""
     rows: dict[str, Any] = {}
     for quality in effect.qualities():
-        mean = float(effect.values[quality.name])
+        mean = effect.presented(quality)
         std = stds.get(f"{effect.label}.{quality.name}")
         base, bracket, _ = quality.name.partition("[")
         if bracket:

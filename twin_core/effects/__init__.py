@@ -5,15 +5,22 @@ from typing import Any
 from twin_core.effects.base import Effect, Quality, Survey, Where, require
 from twin_core.effects.base import to_json as effect_to_json
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
+from twin_core.effects.conductance_step import ConductanceStep
+from twin_core.effects.conductance_temperature import ConductanceTemperature
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
+from twin_core.effects.emissivity_step import EmissivityStep
 from twin_core.effects.hidden_mass import HiddenMass
+from twin_core.effects.input_drift import InputDrift
 from twin_core.effects.input_gain import InputGain
 from twin_core.effects.input_power_law import InputPowerLaw
+from twin_core.effects.input_step import InputStep
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.effects.missing_conductor import MissingConductor
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
+from twin_core.effects.sensor_bias import SensorBias
+from twin_core.effects.sensor_drift import SensorDrift
 from twin_core.effects.sensor_lag import SensorLag
 from twin_core.errors import ModelError, SpecError
 
@@ -28,7 +35,14 @@ REGISTRY: dict[str, type[Effect]] = {
         ProportionalHeater,
         InputGain,
         InputPowerLaw,
+        InputStep,
+        InputDrift,
+        ConductanceStep,
+        ConductanceTemperature,
+        EmissivityStep,
         HiddenMass,
+        SensorBias,
+        SensorDrift,
         SensorLag,
         LearnedHeatFlow,
     )

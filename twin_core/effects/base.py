@@ -16,7 +16,8 @@ from twin_core.errors import ModelError
 from twin_core.network.model import Addition, ExtraNode, Layout
 from twin_core.network.terms import Along, ReadingTerm, Term
 from twin_core.parameters.parameter import Parameter
-from twin_core.parameters.transforms import Identity, Log
+from twin_core.parameters.transforms import Floored, Identity, Log, Shifted, Transform
+from twin_core.units import format_instant
 
 Where = dict[str, Any]
 
@@ -34,7 +35,11 @@ class Quality:
     positive
         Whether the value must stay positive.
     prior_std
-        Weak prior around the starting value, in ln for positive ones; None = flat.
+        Weak prior around the starting value, in ln for positive ones, in scales for instants; None = flat.
+    lower
+        The least value, itself possible; None where there is none or the value is positive anyway.
+    instant
+        For an instant on the clock of ``Record.clock_s``: where the solver counts from, and in what; None for others.
     """
 
     name: str
@@ -42,6 +47,25 @@ class Quality:
     null: float | None = None
     positive: bool = False
     prior_std: float | None = None
+    lower: float | None = None
+    instant: Shifted | None = None
+
+    @property
+    def transform(self) -> Transform:
+        """How a solver moves it."""
+        if self.positive:
+            return Log()
+        return self.instant or (Identity() if self.lower is None else Floored(self.lower))
+
+    def moved(self, amount: float) -> float | None:
+        """Return the value at a distance from null, on the bound where it lies a little beyond; None far beyond it."""
+        assert self.null is not None
+        value = self.null + amount
+        if self.positive:
+            return value if value > 1e-12 else None
+        if self.lower is None or value >= self.lower:
+            return value
+        return self.lower if value - self.lower > self.lower - self.null else None
 
 
 @dataclass(frozen=True)
@@ -83,6 +107,11 @@ class Survey:
     def temperature_K(self, node: str) -> FloatArray:
         """Return a node's temperature along the record, (n_points,)."""
         return self.along.temperatures_K[:, self.layout.node(node)]
+
+    @property
+    def begin_s(self) -> float:
+        """The first sample, on the clock of ``along``."""
+        return float(self.sample_s.min())
 
     def segments(self) -> Iterable[slice]:
         """Yield the points of each segment."""
@@ -158,6 +187,10 @@ class Effect(ABC):
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the effect at its null amplitude for a grid of its nonlinear settings."""
 
+    def refined(self, survey: Survey) -> Iterable[Self]:
+        """Yield starts between this one and its neighbours, where ``starts`` is too coarse for a local search; or none."""
+        return ()
+
     def extra_nodes(self, layout: Layout) -> tuple[ExtraNode, ...]:
         """Return the states that the effect adds; none for most."""
         return ()
@@ -185,15 +218,15 @@ class Effect(ABC):
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the effect's parameters under their full names."""
         return tuple(
-            Parameter(
-                f"{self.label}.{q.name}",
-                q.unit,
-                float(self.values[q.name]),
-                Log() if q.positive else Identity(),
-                q.prior_std,
-            )
+            Parameter(f"{self.label}.{q.name}", q.unit, float(self.values[q.name]), q.transform, q.prior_std)
             for q in self.qualities()
         )
+
+    def presented(self, quality: Quality) -> float | str:
+        """Return a value as people read it: an instant in the telemetry's own form, to the millisecond where dated."""
+        value = float(self.values[quality.name])
+        is_date = quality.instant is not None and self.settings["dated"]
+        return format_instant(round(1e3 * value) * 1_000_000) if is_date else value
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
@@ -214,12 +247,10 @@ class Effect(ABC):
         qualities = self.qualities()
         moved = {}
         for i, amount in zip(self.amplitudes, amounts, strict=True):
-            quality = qualities[i]
-            assert quality.null is not None
-            value = quality.null + float(amount)
-            if quality.positive and not value > 1e-12:
+            value = qualities[i].moved(float(amount))
+            if value is None:
                 return None
-            moved[quality.name] = value
+            moved[qualities[i].name] = value
         return self.with_values(moved)
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:

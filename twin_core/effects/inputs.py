@@ -13,7 +13,7 @@ from twin_core.network.terms import Along, ChannelLoad, Entry, Heat
 from twin_core.parameters.parameter import Parameter
 
 Shape = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, list[FloatArray]]]
-"""(declared u, time_s, values) -> correction of u, and its derivative by each value; all (n_points,)."""
+"""(declared u, clock_s, values) -> correction of u, and its derivative by each value; all (n_points,)."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class InputCorrection:
         return Heat((node,), (gain * factor * correction)[:, None], np.zeros((1, 1, 1)), entries)
 
 
-def correct_channel(effect: Effect, layout: Layout, shape: Shape) -> Addition:
+def correct_channel(effect: Effect, layout: Layout, shape: Shape, dated: bool | None = None) -> Addition:
     """Return one correction per declared load of the effect's channel; ModelError if it drives none."""
     loads = [load for load in layout.loads_of(effect.where["channel"]) if load.table is None]
     if not loads:
@@ -51,7 +51,8 @@ def correct_channel(effect: Effect, layout: Layout, shape: Shape) -> Addition:
                 (gain_name(load),),
             )
             for load in loads
-        )
+        ),
+        dated=dated,
     )
 
 

@@ -131,6 +131,13 @@ def gain_name(load: Load) -> str:
     return f"gain:{load.channel}|{load.node}"
 
 
+def radiator_name(spec: TwinSpec, i: int) -> str:
+    """Return the name of the exchange area of a declared radiator, such as ``R:px|space``; numbered if not the first."""
+    node, sink = spec.radiators[i].node, spec.radiators[i].sink
+    repeated = any((r.node, r.sink) == (node, sink) for r in spec.radiators[:i])
+    return f"R:{node}|{sink}" + (f"#{i}" if repeated else "")
+
+
 def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -> Parameter:
     """Return the parameter of a declared quantity; an undeclared one starts from ``default`` with a flat prior."""
     value = guess_or(quantity, default)
@@ -292,16 +299,10 @@ def _declared_terms(layout: Layout) -> list[Term]:
             terms.append(BoundaryConductor(layout.node(node), layout.boundary(outer[0]), (parameter,)))
     for i, radiator in enumerate(spec.radiators):
         area = radiator.emissivity * radiator.area_m2
-        name = f"R:{radiator.node}|{radiator.sink}" + (f"#{i}" if _repeated(spec, i) else "")
-        parameter = positive(name, "m2", area, frozen=True)
+        parameter = positive(radiator_name(spec, i), "m2", area, frozen=True)
         terms.append(SinkRadiation(layout.node(radiator.node), layout.boundary(radiator.sink), (parameter,)))
     terms += [_load_term(layout, load) for load in spec.loads]
     return terms
-
-
-def _repeated(spec: TwinSpec, i: int) -> bool:
-    """Return whether an earlier radiator joins the same node and sink."""
-    return any((r.node, r.sink) == (spec.radiators[i].node, spec.radiators[i].sink) for r in spec.radiators[:i])
 
 
 def _conductance(between: tuple[str, str], quantity: Quantity | None) -> Parameter:

@@ -1,0 +1,30 @@
+"""A declared radiator that changes at an instant: contamination, a cover that opened, a coating that came off."""
+
+from collections.abc import Iterable
+
+from twin_core.effects.base import Quality, Where
+from twin_core.effects.declared import Changed, declared_radiators, radiator_places
+from twin_core.effects.onset import OnsetEffect
+from twin_core.network.model import Addition, Layout
+
+
+class EmissivityStep(OnsetEffect):
+    """epsilon -> f epsilon from an instant on."""
+
+    name = "emissivity_step"
+    keys = ("node", "sink")
+    equation = "q = sigma f epsilon A (T_s^4 - T^4) from time on"
+    reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 4 (thermal surface finishes)"
+    words = "radiates another share to {sink} than declared from an instant on"
+    amplitude = Quality("f", "", null=1.0, lower=0.0)
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return the change of every radiator that is declared between the node and the sink."""
+        radiators = declared_radiators(self, layout)
+        terms = tuple(Changed(radiator, self.change, self.parameters(), (name,)) for radiator, name in radiators)
+        return Addition(terms, dated=self.settings["dated"])
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every declared radiator."""
+        yield from radiator_places(layout)

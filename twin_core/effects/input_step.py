@@ -1,0 +1,43 @@
+"""A heat input that changes at an instant: a dead heater, a lost string, a switch to a redundant circuit."""
+
+from collections.abc import Iterable
+from typing import Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.effects.base import Quality, Survey, Where
+from twin_core.effects.inputs import correct_channel, driving_channels
+from twin_core.effects.onset import OnsetEffect
+from twin_core.network.model import Addition, Layout
+
+
+class InputStep(OnsetEffect):
+    """delivered = f * declared from an instant on."""
+
+    name = "input_step"
+    keys = ("channel",)
+    equation = "delivered = f declared from time on"
+    reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
+    words = "delivers another share of its declared heat from an instant on"
+    amplitude = Quality("f", "", null=1.0, lower=0.0)
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return the corrections of the channel's loads."""
+
+        def shape(declared: FloatArray, clock_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+            change, slopes = self.change(clock_s, values)
+            return change * declared, [slope * declared for slope in slopes]
+
+        return correct_channel(self, layout, shape, dated=self.settings["dated"])
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every channel that drives a load."""
+        yield from driving_channels(layout)
+
+    @classmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield onsets over the record of a channel that is on at times."""
+        if np.any(survey.along.inputs.get(where["channel"], 0.0)):
+            yield from super().starts(where, survey)
