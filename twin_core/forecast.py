@@ -186,10 +186,11 @@ def _variance(
     time_s: FloatArray,
 ) -> FloatArray:
     """Return the variance of the readings, (n_times, n_sensors), in K^2."""
-    n_free, n_nodes = len(model.free_names), len(network.nodes)
+    n_free, n_nodes = int(network.parameters.free_index.size), len(network.nodes)
     starts = np.hstack([np.zeros((n_nodes, n_free)), np.eye(n_nodes)])
     covariance = np.zeros((n_free + n_nodes, n_free + n_nodes))
-    covariance[:n_free, :n_free] = model.covariance
+    if model.free_names:  # a method may state no covariance
+        covariance[:n_free, :n_free] = model.covariance
     covariance[n_free:, n_free:] = state_covariance
     blocks = [
         ((block @ covariance) * block).sum(axis=-1)

@@ -39,7 +39,7 @@ def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, out: Pa
     with progress_bar("calibrating") as progress:
         model = fit(spec, records, method=method, progress=progress)
     write_text(out, to_json(model.to_json()))
-    notify([notice for record in records for notice in record.notices])
+    notify(model.summary["notices"])
     if as_json:
         print_line(to_json({"out": str(out)} | model.summary).rstrip())
     else:
@@ -48,7 +48,7 @@ def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, out: Pa
 
 def _print_summary(summary: dict[str, Any], out: Path) -> None:
     """Print the parameters with their uncertainty, the misfit of each sensor, and what the data cannot tell."""
-    from replay.cli.console import notify, print_line, print_table, short
+    from replay.cli.console import print_line, print_table, short
 
     parameters = [
         [p["name"], short(p["mean"], 4), short(p["std"], 2), p.get("unit") or ""] for p in summary["parameters"]
@@ -58,5 +58,4 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     print_table("training misfit", ["sensor", "rmse K", "bias K"], sensors)
     for words in summary.get("words", ()):
         print_line(words)
-    notify(summary.get("notices", ()))
     print_line(f"wrote {out}")

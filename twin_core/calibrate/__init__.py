@@ -11,7 +11,7 @@ from twin_core.errors import ModelError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
-METHODS = ("second-order",)
+METHODS = ("second-order", "neural-ode")
 
 
 def calibrate(
@@ -30,7 +30,8 @@ def calibrate(
     records
         Segments of telemetry in SI, each with its own initial state.
     method
-        ``second-order``: Levenberg-Marquardt with exact sensitivities.
+        ``second-order``: Levenberg-Marquardt with exact sensitivities. ``neural-ode``: the method of paper A
+        (arXiv 2605.28452), Adam on windows of the record; it states no uncertainty of the parameters.
     progress
         Called with the fraction done and a message.
 
@@ -48,8 +49,13 @@ def calibrate(
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
     from twin_core.calibrate.second_order import fit_network, to_model
 
-    _, calibration = fit_network(spec, records, progress=progress)
-    model = to_model(calibration, ())
+    if method == "neural-ode":
+        from twin_core.calibrate.neural_ode import fit_neural_ode
+
+        _, calibration = fit_neural_ode(spec, records, progress=progress)
+    else:
+        _, calibration = fit_network(spec, records, progress=progress)
+    model = to_model(calibration, (), uncertain=method != "neural-ode")
     progress(1.0, "calibrated")
     return model
 

@@ -9,12 +9,13 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.problem import Fit, Problem
 
-Status = Literal["converged", "stalled", "iteration_limit", "no_solution"]
+Status = Literal["converged", "stalled", "iteration_limit", "early_stopping", "no_solution"]
 
 ADVICE: dict[Status, str] = {
     "converged": "the cost no longer falls",
     "stalled": "no step lowers the cost any more: the data hardly tell some parameters apart",
     "iteration_limit": "stopped at the iteration limit while the cost still fell: start from better guesses",
+    "early_stopping": "the error on the validation windows no longer falls",
     "no_solution": "the heat balance has no solution at the guesses: check the order of magnitude of loads and radiators",
 }
 

@@ -32,7 +32,7 @@ class CalibratedModel:
     covariance : (n_free, n_free)
         Of the free parameters in the solver's coordinate (ln for positive ones), in the order of ``free_names``.
     free_names
-        Names of the calibrated parameters.
+        Names of the calibrated parameters; none, and no covariance, where the method states no uncertainty.
     noise_K
         Sensor -> white noise standard deviation.
     misfit_K, misfit_length_s

@@ -26,6 +26,8 @@ from twin_core.telemetry import Record
 STEP_ERROR_SHARE = 0.1
 """Time steps are halved until halving changes no reading by more than this share of the noise."""
 
+NO_COVARIANCE = "this method states no uncertainty of the parameters; forecasts carry only that of state and misfit"
+
 MAX_HALVINGS = 3
 N_STARTS = 4
 
@@ -175,20 +177,23 @@ def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> Fl
     return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
 
 
-def to_model(calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = ()) -> CalibratedModel:
-    """Return the calibrated model of a fit, with uncertainty and plain words."""
+def to_model(
+    calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
+) -> CalibratedModel:
+    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told."""
     problem, optimum = calibration.problem, calibration.optimum
     network, spec = calibration.network, calibration.network.spec
-    covariance = gls_covariance(problem, optimum, calibration.whitener)
-    free = covariance[: problem.n_free, : problem.n_free]
+    free = None
+    if uncertain:
+        free = gls_covariance(problem, optimum, calibration.whitener)[: problem.n_free, : problem.n_free]
     values = network.parameters.as_dict()
     misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
     return CalibratedModel(
         spec,
         tuple(_carrying(effect.at_parameters(values), network.parameters.free_names, free) for effect in effects),
         values,
-        free,
-        network.parameters.free_names,
+        np.zeros((0, 0)) if free is None else free,
+        () if free is None else network.parameters.free_names,
         {s: float(n) for s, n in zip(spec.sensors, problem.noise_K, strict=True)},
         {s: float(m.sigma_ou) for s, m in misfit.items()},
         {s: float(m.length_s) for s, m in misfit.items()},
@@ -198,18 +203,22 @@ def to_model(calibration: Calibration, effects: Sequence[Effect], notices: Seque
     )
 
 
-def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray) -> Effect:
-    """Return an effect with the covariance of its own parameters."""
+def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray | None) -> Effect:
+    """Return an effect with the covariance of its own parameters, where there is one."""
+    if covariance is None:
+        return effect
     own = [free_names.index(p.name) for p in effect.parameters()]
     return effect.learned(covariance[np.ix_(own, own)])
 
 
-def _summary(calibration: Calibration, covariance: FloatArray, notices: Sequence[str]) -> Json:
+def _summary(calibration: Calibration, covariance: FloatArray | None, notices: Sequence[str]) -> Json:
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
-    slopes = network.parameters.slopes(network.parameters.free)
-    stds = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * slopes
-    by_name = dict(zip(network.parameters.free_names, stds.tolist(), strict=True))
+    by_name: dict[str, float] = {}
+    if covariance is not None:
+        slopes = network.parameters.slopes(network.parameters.free)
+        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * slopes
+        by_name = dict(zip(network.parameters.free_names, stds.tolist(), strict=True))
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
@@ -230,7 +239,7 @@ def _summary(calibration: Calibration, covariance: FloatArray, notices: Sequence
             {"name": p.name, "unit": p.unit, "mean": p.value, "std": by_name.get(p.name), "held": p.frozen}
             for p in network.parameters.parameters
         ],
-        "words": words(network.parameters, covariance),
+        "words": [NO_COVARIANCE] if covariance is None else words(network.parameters, covariance),
         "notices": list(dict.fromkeys([*notices, *heard])),
     }
 
