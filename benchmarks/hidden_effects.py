@@ -104,6 +104,54 @@ def hidden_mass(world: World, node: int) -> Hidden:
     )
 
 
+def radiative_exchange(world: World, node: int) -> Hidden:
+    """Return two faces that see each other."""
+    a, b = _free_pair(world)
+    area = float(world.rng.uniform(0.08, 0.35))
+    heat = _between(world, a, b, lambda t, k, x: SIGMA * area * (x[b] ** 4 - x[a] ** 4))
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat)
+
+
+def nonlinear_convection(world: World, node: int) -> Hidden:
+    """Return convection to the room."""
+    k0, p = float(world.rng.uniform(0.1, 0.5)), float(world.rng.uniform(1.2, 2.0))
+
+    def q(t: float, k: int, x: float) -> float:
+        d = world.room_K[k] - x
+        return k0 * float(np.sign(d) * abs(d) ** p)
+
+    return Hidden({"node": f"n{node}", "boundary": "room"}, _into(world, node, q))
+
+
+def capacity_temperature(world: World, node: int) -> Hidden:
+    """Return a capacity that changes by a third to all of itself over the visited range."""
+    healthy = world.simulate()[:, node]
+    low, high = np.quantile(healthy, (0.02, 0.98))
+    kappa = float(world.rng.uniform(0.3, 0.9) * world.rng.choice([-1.0, 1.0]) / (high - low))
+    centre = 0.5 * (low + high)
+
+    def capacity(x: np.ndarray) -> np.ndarray:
+        more = np.zeros(world.n)
+        more[node] = world.capacity[node] * max(kappa * (x[node] - centre), -0.8)
+        return more
+
+    return Hidden({"node": f"n{node}"}, capacity=capacity)
+
+
+def latent_heat(world: World, node: int) -> Hidden:
+    """Return a phase change within the visited range."""
+    low, high = np.quantile(world.simulate()[:, node], (0.1, 0.9))
+    centre, width = float(world.rng.uniform(low, high)), float(world.rng.uniform(0.3, 1.0))
+    area = float(world.capacity[node] * world.rng.uniform(0.4, 1.2) * (high - low))
+
+    def capacity(x: np.ndarray) -> np.ndarray:
+        more = np.zeros(world.n)
+        more[node] = area * np.exp(-0.5 * ((x[node] - centre) / width) ** 2) / (width * np.sqrt(2.0 * np.pi))
+        return more
+
+    return Hidden({"node": f"n{node}"}, capacity=capacity)
+
+
 HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
     make.__name__: make
     for make in (
@@ -115,5 +163,9 @@ HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
         input_gain,
         missing_conductor,
         hidden_mass,
+        radiative_exchange,
+        nonlinear_convection,
+        capacity_temperature,
+        latent_heat,
     )
 }

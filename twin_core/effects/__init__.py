@@ -4,6 +4,7 @@ from typing import Any
 
 from twin_core.effects.base import Effect, Quality, Survey, Where, require
 from twin_core.effects.base import to_json as effect_to_json
+from twin_core.effects.capacity_temperature import CapacityTemperature
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
 from twin_core.effects.conductance_step import ConductanceStep
 from twin_core.effects.conductance_temperature import ConductanceTemperature
@@ -14,11 +15,14 @@ from twin_core.effects.input_drift import InputDrift
 from twin_core.effects.input_gain import InputGain
 from twin_core.effects.input_power_law import InputPowerLaw
 from twin_core.effects.input_step import InputStep
+from twin_core.effects.latent_heat import LatentHeat
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.effects.missing_conductor import MissingConductor
+from twin_core.effects.nonlinear_convection import NonlinearConvection
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
+from twin_core.effects.radiative_exchange import RadiativeExchange
 from twin_core.effects.sensor_bias import SensorBias
 from twin_core.effects.sensor_drift import SensorDrift
 from twin_core.effects.sensor_lag import SensorLag
@@ -28,8 +32,10 @@ REGISTRY: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
         RadiationToSink,
+        RadiativeExchange,
         MissingConductor,
         LeakToBoundary,
+        NonlinearConvection,
         ConstantHeatLoad,
         ChannelHeatLoad,
         ProportionalHeater,
@@ -40,6 +46,8 @@ REGISTRY: dict[str, type[Effect]] = {
         ConductanceStep,
         ConductanceTemperature,
         EmissivityStep,
+        CapacityTemperature,
+        LatentHeat,
         HiddenMass,
         SensorBias,
         SensorDrift,

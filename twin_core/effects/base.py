@@ -14,7 +14,7 @@ import numpy as np
 from twin_core._typing import BoolArray, FloatArray, Json
 from twin_core.errors import ModelError
 from twin_core.network.model import Addition, ExtraNode, Layout
-from twin_core.network.terms import Along, ReadingTerm, Term
+from twin_core.network.terms import Along, CapacityTerm, ReadingTerm, Term
 from twin_core.parameters.parameter import Parameter
 from twin_core.parameters.transforms import Floored, Identity, Log, Shifted, Transform
 from twin_core.units import format_instant
@@ -254,13 +254,23 @@ class Effect(ABC):
         return self.with_values(moved)
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
-        """Return d heat / d amplitude along the survey: per amplitude a list of (node, (n_points,) in W per unit)."""
+        """Return d heat / d amplitude along the survey: per amplitude a list of (node, (n_points,) in W per unit).
+
+        Extra capacity counts as the heat that it swallows at the rates of the survey.
+        """
         columns: list[list[tuple[int, FloatArray]]] = [[] for _ in self.amplitudes]
-        for term in self._alone(survey.layout).terms:
+        alone = self._alone(survey.layout)
+        for term in alone.terms:
             scaled = self._scaled_by(term.parameters)
             for entry in term.evaluate(survey.along, self._null_values(term, survey)).d_values:
                 if entry.item in scaled:
                     columns[scaled[entry.item]].append((entry.node, entry.series))
+        for capacity in alone.capacities:
+            scaled = self._scaled_by(capacity.parameters)
+            for entry in capacity.evaluate(survey.along, self._null_values(capacity, survey)).d_values:
+                if entry.item in scaled:
+                    swallowed = -entry.series * survey.rate_K_per_s[:, entry.node]
+                    columns[scaled[entry.item]].append((entry.node, swallowed))
         return columns
 
     def unit_readings(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
@@ -283,7 +293,7 @@ class Effect(ABC):
         names = [f"{self.label}.{self.qualities()[i].name}" for i in self.amplitudes]
         return {i: names.index(p.name) for i, p in enumerate(own) if p.name in names}
 
-    def _null_values(self, term: Term | ReadingTerm, survey: Survey) -> FloatArray:
+    def _null_values(self, term: Term | CapacityTerm | ReadingTerm, survey: Survey) -> FloatArray:
         """Return a term's values where the effect vanishes, then those that it borrows from the declared model."""
         null = {f"{self.label}.{q.name}": self.values[q.name] if q.null is None else q.null for q in self.qualities()}
         return np.array([null[p.name] for p in term.parameters] + [survey.parameters[name] for name in term.borrows])

@@ -49,6 +49,32 @@ def test_missing_conductor() -> None:
     np.testing.assert_allclose(found, 2.0 * np.outer([10.0, 50.0, 10.0], [-1.0, 0.0, 1.0]))
 
 
+def test_radiative_exchange() -> None:
+    found = heat_W(REGISTRY["radiative_exchange"]({"nodes": ["c", "a"]}, {"R_m2": 0.2}))
+    expected = SIGMA * 0.2 * (ALONG.temperatures_K[:, 2] ** 4 - ALONG.temperatures_K[:, 0] ** 4)
+    np.testing.assert_allclose(found, np.outer(expected, [1.0, 0.0, -1.0]))
+
+
+@pytest.mark.parametrize("p", [0.5, 1.0, 1.25, 2.0])
+def test_nonlinear_convection(p: float) -> None:
+    found = heat_W(REGISTRY["nonlinear_convection"]({"node": "c", "boundary": "room"}, {"k": 0.4, "p": p}))
+    np.testing.assert_allclose(found[:, 2], 0.4 * np.array([5.0, 35.0, 35.0]) ** p, rtol=5e-6)
+    np.testing.assert_array_equal(found[:, :2], 0.0)
+
+
+def test_nonlinear_convection_is_odd_and_its_slope_bounded() -> None:
+    term = REGISTRY["nonlinear_convection"]({"node": "a", "boundary": "room"}, {"k": 0.4, "p": 0.5})
+    (part,) = term.addition(every_term_network([term]).layout).terms
+    difference = np.array([-20.0, -1e-9, 0.0, 1e-9, 20.0])
+    along = Along(
+        np.arange(5.0), 295.0 - np.outer(difference, np.ones(3)), np.full((5, 3), 295.0), ALONG.inputs, np.ones(5)
+    )
+    heat = part.evaluate(along, np.array([0.4, 0.5]))
+    np.testing.assert_allclose(heat.heat_W, -heat.heat_W[::-1], atol=1e-12)
+    assert heat.heat_W[2, 0] == 0.0 and np.isfinite(heat.d_temperature).all()
+    assert all(np.isfinite(entry.series).all() for entry in (*heat.d_values, *heat.d_boundaries))
+
+
 def test_leak_to_boundary() -> None:
     found = heat_W(REGISTRY["leak_to_boundary"]({"node": "c", "boundary": "room"}, {"G_W_per_K": 0.5}))
     np.testing.assert_allclose(found[:, 2], [2.5, 17.5, 17.5])

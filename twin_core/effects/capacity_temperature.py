@@ -1,0 +1,74 @@
+"""A capacity that changes with temperature: polymers, propellants, cryogenic metals."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.network.model import Addition, Layout
+from twin_core.network.terms import Along, Capacity, Entry
+from twin_core.parameters.parameter import Parameter
+
+LEAST_SHARE = 0.2
+"""Below this share of the declared capacity the straight line bends into a hyperbola that stays positive."""
+
+
+@dataclass(frozen=True)
+class LinearCapacity:
+    """C -> C (1 + kappa (T - T_ref)); values are kappa and the declared C."""
+
+    node: int
+    reference_K: float
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...]
+
+    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
+        """Evaluate the change of capacity; the node's own capacity is borrowed."""
+        kappa, capacity = values
+        away = along.temperatures_K[:, self.node] - self.reference_K
+        line = 1.0 + kappa * away
+        bend = 1.0 / (2.0 - np.minimum(line / LEAST_SHARE, 1.0))
+        share = np.where(line < LEAST_SHARE, LEAST_SHARE * bend, line)
+        slope = bend**2
+        return Capacity(
+            self.node,
+            capacity * (share - 1.0),
+            capacity * slope * kappa,
+            [Entry(0, self.node, capacity * slope * away), Entry(1, self.node, share - 1.0)],
+        )
+
+
+class CapacityTemperature(Effect):
+    """C -> C (1 + kappa (T - T_ref))."""
+
+    name = "capacity_temperature"
+    keys = ("node",)
+    equation = "C -> C (1 + kappa (T - T_ref)), T_ref = mean T of the training record"
+    reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15: temperature-dependent properties"
+    words = "stores more or less heat per kelvin as it warms"
+    reported_settings = ("T_ref_K",)
+
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return the relative change of capacity per kelvin."""
+        return (Quality("kappa_per_K", "1/K", null=0.0),)
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return the change of capacity."""
+        node = self.where["node"]
+        reference = float(self.settings["T_ref_K"])
+        term = LinearCapacity(layout.node(node), reference, self.parameters(), (f"C:{node}",))
+        return Addition(capacities=(term,))
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every node."""
+        yield from ({"node": node} for node in layout.declared_nodes)
+
+    @classmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield the null effect about the mean temperature."""
+        reference = float(survey.temperature_K(where["node"]).mean())
+        yield cls(where, {"kappa_per_K": 0.0}, {"T_ref_K": reference})

@@ -1,0 +1,78 @@
+"""A change of phase inside a node: a phase-change material, freezing propellant, a solid transition."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.network.model import Addition, Layout
+from twin_core.network.terms import Along, Capacity, Entry
+from twin_core.parameters.parameter import Parameter
+
+N_CENTRES = 9
+WIDTH_SHARES = (0.03, 0.08, 0.2)
+"""Widths that are tried, as shares of the visited range."""
+
+
+@dataclass(frozen=True)
+class Melting:
+    """Extra capacity: a Gaussian in T of area L; values are L, T_m, w."""
+
+    node: int
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
+        """Evaluate the extra capacity (apparent heat capacity method)."""
+        heat, centre, width = values
+        x = (along.temperatures_K[:, self.node] - centre) / width
+        density = np.exp(-0.5 * x**2) / (np.sqrt(2.0 * np.pi) * width)
+        extra = heat * density
+        return Capacity(
+            self.node,
+            extra,
+            -extra * x / width,
+            [
+                Entry(0, self.node, density),
+                Entry(1, self.node, extra * x / width),
+                Entry(2, self.node, extra * (x**2 - 1.0) / width),
+            ],
+        )
+
+
+class LatentHeat(Effect):
+    """C -> C + L g(T), g a Gaussian of area one."""
+
+    name = "latent_heat"
+    keys = ("node",)
+    equation = "C -> C + L g(T), g = exp(-(T - T_m)^2 / (2 w^2)) / (w sqrt(2 pi))"
+    reference = "Bonacina et al., Int. J. Heat Mass Transfer 16 (1973): apparent heat capacity"
+    words = "takes up latent heat around a temperature"
+
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return the latent heat, where it melts and over what width."""
+        return (
+            Quality("L_J", "J", null=0.0, positive=True),
+            Quality("T_m_K", "K", prior_std=20.0),
+            Quality("w_K", "K", positive=True, prior_std=1.0),
+        )
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return the extra capacity."""
+        return Addition(capacities=(Melting(layout.node(self.where["node"]), self.parameters()),))
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every node."""
+        yield from ({"node": node} for node in layout.declared_nodes)
+
+    @classmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield centres evenly over the visited range, each with several widths."""
+        low, high = np.quantile(survey.temperature_K(where["node"]), (0.005, 0.995))
+        for centre in np.linspace(low, high, N_CENTRES + 2)[1:-1] if high > low else ():
+            for share in WIDTH_SHARES:
+                yield cls(where, {"L_J": 0.0, "T_m_K": float(centre), "w_K": float(share * (high - low))})
