@@ -13,10 +13,10 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.problem import Problem, Segment
-from twin_core.calibrate.whitening import affine_march, whiten_columns
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.smoother import smooth
-from twin_core.gp.state_space import LinearModel
+from twin_core.latent_force.held import HeldForce
+from twin_core.latent_force.whitening import affine_march
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.kernels import GAMMA, march_sensitivities
@@ -24,7 +24,6 @@ from twin_core.simulate.one_step import Steps, one_step
 from twin_core.simulate.rollout import balance_along
 
 FLOOR_SHARE = 1e-3
-COLUMNS_AT_ONCE = 192
 
 
 @dataclass(frozen=True)
@@ -124,9 +123,7 @@ def linearise(
     """
     network, forcing = problem.network, segment.forcing
     steps = one_step(network, values, forcing, states_K[:-1], extra_W, near_K=near_K)
-    pushed = np.einsum("kij,kj->ki", steps.heat_response_K_per_W, extra_W)
-    offset = steps.ends_K - pushed - np.einsum("kij,kj->ki", steps.transition, states_K[:-1])
-    reference = affine_march(steps.transition, offset, segment.start_prior_K)
+    reference = affine_march(steps.transition, _drift_K(steps, states_K[:-1], extra_W), segment.start_prior_K)
     sample_of = np.full(forcing.n_steps + 1, -1, dtype=np.int64)
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
     offset_K = reading_offsets_K(network, values, segment.record.clock_s)
@@ -139,26 +136,23 @@ def floor_K2(problem: Problem) -> FloatArray:
     return np.full(problem.n_nodes, (FLOOR_SHARE * float(np.median(problem.noise_K))) ** 2)
 
 
+def held_force(problem: Problem, latent: LatentHeat, nominal: Nominal) -> HeldForce:
+    """Return the model of temperatures and undeclared heats of a segment."""
+    return HeldForce(
+        steps=nominal.steps,
+        step_s=nominal.segment.forcing.step_s,
+        std_W=latent.std_W,
+        length_s=latent.length_s,
+        floor_K2=floor_K2(problem),
+        sensor_node=problem.network.sensor_node,
+        noise_K=problem.noise_K,
+        start_std_K=nominal.segment.start_std_K,
+    )
+
+
 def whiten(problem: Problem, latent: LatentHeat, nominal: Nominal, columns: FloatArray) -> tuple[FloatArray, float]:
     """Return columns (n_samples, n_sensors, n_columns) in the metric of the readings, and ln det of their covariance."""
-    keep = np.exp(-nominal.segment.forcing.step_s / latent.length_s)
-    parts, log_det = [], 0.0
-    for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
-        whitened, log_det = whiten_columns(
-            nominal.steps.transition,
-            nominal.steps.heat_response_K_per_W,
-            keep,
-            latent.std_W**2,
-            floor_K2(problem),
-            problem.network.sensor_node,
-            problem.noise_K**2,
-            nominal.segment.start_std_K**2,
-            nominal.sample_of,
-            nominal.segment.valid,
-            np.ascontiguousarray(np.nan_to_num(columns[:, :, first : first + COLUMNS_AT_ONCE])),
-        )
-        parts.append(whitened)
-    return np.concatenate(parts, axis=2), log_det
+    return held_force(problem, latent, nominal).whiten(columns, nominal.sample_of, nominal.segment.valid)
 
 
 def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> float:
@@ -204,42 +198,18 @@ def smoothed_states(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return smoothed temperatures (n_steps + 1, n_nodes), latent heat (n_steps + 1, n_nodes) and its deviation in W."""
     n, forcing = problem.n_nodes, nominal.segment.forcing
-    model = _augmented(problem, latent, nominal)
+    drift = _drift_K(nominal.steps, nominal.starts_K, nominal.extra_W)
+    model = held_force(problem, latent, nominal).linear_model(drift, nominal.segment.start_prior_K)
     stretched = np.full((forcing.n_steps + 1, problem.network.sensor_node.size), np.nan)
     stretched[forcing.sample_step] = nominal.segment.measured_K - nominal.offset_K
     smoothed = smooth(model, kalman_filter(model, stretched, keep="states"))
     return smoothed.mean[:, :n], smoothed.mean[:, n:], np.sqrt(np.maximum(smoothed.variance[:, n:], 0.0))
 
 
-def _augmented(problem: Problem, latent: LatentHeat, nominal: Nominal) -> LinearModel:
-    """Return the model of temperatures and latent heats, [T, q], of a segment."""
-    n, steps, forcing = problem.n_nodes, nominal.steps, nominal.segment.forcing
-    keep = np.exp(-forcing.step_s / latent.length_s)
-    transition = np.zeros((forcing.n_steps, 2 * n, 2 * n))
-    transition[:, :n, :n] = steps.transition
-    transition[:, :n, n:] = steps.heat_response_K_per_W
-    transition[:, np.arange(n, 2 * n), np.arange(n, 2 * n)] = keep[:, None]
-    process = np.zeros_like(transition)
-    process[:, np.arange(n), np.arange(n)] = floor_K2(problem)
-    process[:, np.arange(n, 2 * n), np.arange(n, 2 * n)] = (1.0 - keep**2)[:, None] * latent.std_W**2
-    offset = np.zeros((forcing.n_steps, 2 * n))
-    offset[:, :n] = (
-        steps.ends_K
-        - np.einsum("kij,kj->ki", steps.heat_response_K_per_W, nominal.extra_W)
-        - np.einsum("kij,kj->ki", steps.transition, nominal.starts_K)
-    )
-    observation = np.zeros((problem.noise_K.size, 2 * n))
-    observation[np.arange(problem.noise_K.size), problem.network.sensor_node] = 1.0
-    return LinearModel.build(
-        transition=transition,
-        process_cov=process,
-        offset=offset,
-        observation=observation,
-        noise_variance=problem.noise_K**2,
-        prior_mean=np.concatenate([nominal.segment.start_prior_K, np.zeros(n)]),
-        prior_cov=np.diag(np.concatenate([nominal.segment.start_std_K**2, latent.std_W**2])),
-        n_times=forcing.n_steps + 1,
-    )
+def _drift_K(steps: Steps, starts_K: FloatArray, extra_W: FloatArray) -> FloatArray:
+    """Return what a step adds beyond its linear answer to the start and to undeclared heat, (n_steps, n_nodes)."""
+    pushed = np.einsum("kij,kj->ki", steps.heat_response_K_per_W, extra_W)
+    return np.asarray(steps.ends_K - pushed - np.einsum("kij,kj->ki", steps.transition, starts_K))
 
 
 def states_of(nominal: Nominal) -> FloatArray:

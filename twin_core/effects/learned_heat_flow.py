@@ -9,7 +9,8 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Beyond, Effect, Quality, Survey, Where
 from twin_core.errors import ModelError
-from twin_core.gp.polynomial import SMALLEST_SCALE_K, Basis, ForcePolynomial
+from twin_core.gp.basis import SMALLEST_SCALE_K, Basis
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter

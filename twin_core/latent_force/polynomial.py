@@ -4,7 +4,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
-from twin_core.gp.polynomial import Basis, ForcePolynomial
+from twin_core.gp.basis import Basis
+from twin_core.gp.polynomial import ForcePolynomial
 
 
 def regress_pointwise(

@@ -15,9 +15,10 @@ from scipy.special import logsumexp
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
+from twin_core.gp.basis import Basis
 from twin_core.gp.columns import WhiteRegression, whiten_responses
 from twin_core.gp.discretise import discretise
-from twin_core.gp.polynomial import Basis, ForcePolynomial
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.model import Force, ForceModel, augment, drive, step_table
 from twin_core.latent_force.smooth import LatentForce
 

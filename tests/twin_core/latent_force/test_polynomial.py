@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from twin_core.errors import ModelError
-from twin_core.gp.polynomial import Basis, ForcePolynomial
+from twin_core.gp.basis import Basis
+from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.polynomial import regress_pointwise
 
 T = np.linspace(290.0, 330.0, 41)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_core.calibrate.whitening import affine_march, whiten_columns
+from twin_core.latent_force.whitening import affine_march, whiten_columns
 
 N, N_STEPS, N_COLUMNS = 3, 14, 4
 

@@ -1,0 +1,108 @@
+"""A latent heat on every node over the steps of a rollout: the model in which parameters are fitted and effects weighed.
+
+    states   x = [T_1 ... T_n | q_1 ... q_n]
+    a step   T <- A T + B q + b,   q <- exp(-h / length) q + w,   Var w = (1 - exp(-2 h / length)) std²
+
+The heat is the paper's, Matérn-1/2 (Kouw et al., CCTA 2024, eqs. 5-10), held over the step like the inputs of a rollout. A
+and B are those of the rollout's own scheme, so that what is fitted here holds along trajectories;
+:mod:`twin_core.latent_force.model` is the same model with exact steps, any kernel and any subset of nodes.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twin_core._typing import BoolArray, FloatArray, IntArray
+from twin_core.gp.state_space import LinearModel
+from twin_core.latent_force.whitening import whiten_columns
+from twin_core.simulate.one_step import Steps
+
+COLUMNS_AT_ONCE = 192
+
+
+@dataclass(frozen=True)
+class HeldForce:
+    """The model of one record.
+
+    Attributes
+    ----------
+    steps
+        A and B of every step, (n_steps, n_nodes, n_nodes).
+    step_s : (n_steps,)
+    std_W : (n_nodes,)
+        Stationary standard deviation of the heat on each node.
+    length_s
+        Its correlation length, shared.
+    floor_K2 : (n_nodes,)
+        Variance that every step adds to the temperatures: a filter that is certain of itself goes deaf.
+    sensor_node : (n_sensors,)
+        Node that each sensor reads.
+    noise_K : (n_sensors,)
+    start_std_K : (n_nodes,)
+        Of the temperatures before the first sample.
+    """
+
+    steps: Steps
+    step_s: FloatArray
+    std_W: FloatArray
+    length_s: float
+    floor_K2: FloatArray
+    sensor_node: IntArray
+    noise_K: FloatArray
+    start_std_K: FloatArray
+
+    @property
+    def decay(self) -> FloatArray:
+        """Share of the heat that is left after each step, (n_steps,)."""
+        return np.exp(-self.step_s / self.length_s)
+
+    def whiten(self, columns: FloatArray, sample_of: IntArray, valid: BoolArray) -> tuple[FloatArray, float]:
+        """Return columns of readings in the metric of the model, and ln det of the readings' covariance.
+
+        Parameters
+        ----------
+        columns : (n_samples, n_sensors, n_columns)
+            Anything that adds to the readings, away from the model's own mean; NaN where not ``valid``.
+        sample_of : (n_steps + 1,)
+            Sample at each point of the grid, -1 where there is none.
+        valid : (n_samples, n_sensors)
+        """
+        parts, log_det = [], 0.0
+        for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
+            whitened, log_det = whiten_columns(
+                self.steps.transition,
+                self.steps.heat_response_K_per_W,
+                self.decay,
+                self.std_W**2,
+                self.floor_K2,
+                self.sensor_node,
+                self.noise_K**2,
+                self.start_std_K**2,
+                sample_of,
+                valid,
+                np.ascontiguousarray(np.nan_to_num(columns[:, :, first : first + COLUMNS_AT_ONCE])),
+            )
+            parts.append(whitened)
+        return np.concatenate(parts, axis=2), log_det
+
+    def linear_model(self, drift_K: FloatArray, prior_mean_K: FloatArray) -> LinearModel:
+        """Return the same model for filter and smoother, with b (n_steps, n_nodes) and a mean of the start (n_nodes,)."""
+        n_steps, n = drift_K.shape
+        own, heat = np.arange(n), np.arange(n, 2 * n)
+        transition, process = np.zeros((n_steps, 2 * n, 2 * n)), np.zeros((n_steps, 2 * n, 2 * n))
+        transition[:, :n, :n], transition[:, :n, n:] = self.steps.transition, self.steps.heat_response_K_per_W
+        transition[:, heat, heat] = self.decay[:, None]
+        process[:, own, own] = self.floor_K2
+        process[:, heat, heat] = (1.0 - self.decay**2)[:, None] * self.std_W**2
+        observation = np.zeros((self.noise_K.size, 2 * n))
+        observation[np.arange(self.noise_K.size), self.sensor_node] = 1.0
+        return LinearModel.build(
+            transition=transition,
+            process_cov=process,
+            offset=np.hstack([drift_K, np.zeros((n_steps, n))]),
+            observation=observation,
+            noise_variance=self.noise_K**2,
+            prior_mean=np.concatenate([prior_mean_K, np.zeros(n)]),
+            prior_cov=np.diag(np.concatenate([self.start_std_K**2, self.std_W**2])),
+            n_times=n_steps + 1,
+        )
