@@ -152,6 +152,84 @@ def latent_heat(world: World, node: int) -> Hidden:
     return Hidden({"node": f"n{node}"}, capacity=capacity)
 
 
+def _onset_s(world: World) -> float:
+    """Return an instant in the first part of the record, seldom a sample's."""
+    return float(world.rng.uniform(0.15, 0.6) * world.time_s[-1])
+
+
+def _fraction(world: World) -> float:
+    """Return what is left after a step: nothing, less, or more."""
+    return float(world.rng.choice([0.0, world.rng.uniform(0.3, 0.7), world.rng.uniform(1.4, 2.0)]))
+
+
+def input_step(world: World, node: int) -> Hidden:
+    """Return a payload heat that changes at an instant."""
+    channel, onset, f = int(world.rng.choice(list(world.power))), _onset_s(world), _fraction(world)
+    heat = _into(world, channel, lambda t, k, x: (f - 1.0) * world.power[channel][k] if t >= onset else 0.0)
+    return Hidden({"channel": f"P{channel}"}, heat, onset_s=onset)
+
+
+def input_drift(world: World, node: int) -> Hidden:
+    """Return a payload heat that gains or loses up to four fifths over the record."""
+    channel = int(world.rng.choice(list(world.power)))
+    rate = float(world.rng.uniform(0.4, 0.8) * world.rng.choice([-1.0, 1.0]) / world.time_s[-1])
+    heat = _into(world, channel, lambda t, k, x: rate * t * world.power[channel][k])
+    return Hidden({"channel": f"P{channel}"}, heat)
+
+
+def _edge(world: World) -> tuple[int, int, float]:
+    """Return a declared conductor and its conductance."""
+    edge = int(world.rng.integers(0, len(world.edges)))
+    return *world.edges[edge], float(world.conductance[edge])
+
+
+def conductance_step(world: World, node: int) -> Hidden:
+    """Return a strap that changes at an instant."""
+    (a, b, g), onset, f = _edge(world), _onset_s(world), _fraction(world)
+    heat = _between(world, a, b, lambda t, k, x: (f - 1.0) * g * (x[b] - x[a]) if t >= onset else 0.0)
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat, onset_s=onset)
+
+
+def conductance_temperature(world: World, node: int) -> Hidden:
+    """Return a strap that conducts better or worse by one to three per cent per kelvin."""
+    a, b, g = _edge(world)
+    beta = float(world.rng.uniform(0.01, 0.03) * world.rng.choice([-1.0, 1.0]))
+    reference = float(world.simulate()[:, [a, b]].mean())
+
+    def exchange(t: float, k: int, x: np.ndarray) -> float:
+        return g * max(beta * (0.5 * (x[a] + x[b]) - reference), -1.0) * (x[b] - x[a])
+
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, _between(world, a, b, exchange))
+
+
+def emissivity_step(world: World, node: int) -> Hidden:
+    """Return a radiator that radiates less or more from an instant on."""
+    at = int(world.rng.choice(list(world.radiators)))
+    onset, area = _onset_s(world), world.radiators[at]
+    f = float(world.rng.choice([world.rng.uniform(0.6, 0.85), world.rng.uniform(1.15, 1.4)]))
+    heat = _into(world, at, lambda t, k, x: (f - 1.0) * area * SIGMA * (SPACE_K**4 - x**4) if t >= onset else 0.0)
+    return Hidden({"node": f"n{at}", "sink": "space"}, heat, onset_s=onset)
+
+
+def _misread(world: World, node: int, offset_K: np.ndarray, onset_s: float | None = None) -> Hidden:
+    """Return a fault of the sensor of one node."""
+    columns = np.zeros((world.time_s.size, world.n))
+    columns[:, node] = offset_K
+    return Hidden({"sensor": f"T{node}"}, offset_K=columns, onset_s=onset_s)
+
+
+def sensor_bias(world: World, node: int) -> Hidden:
+    """Return a sensor that reads too much or too little from an instant on."""
+    onset, b = _onset_s(world), float(world.rng.uniform(0.5, 3.0) * world.rng.choice([-1.0, 1.0]))
+    return _misread(world, node, np.where(world.time_s >= onset, b, 0.0), onset)
+
+
+def sensor_drift(world: World, node: int) -> Hidden:
+    """Return a sensor that drifts by some kelvins over the record."""
+    rate = float(world.rng.uniform(1.0, 4.0) * world.rng.choice([-1.0, 1.0]) / world.time_s[-1])
+    return _misread(world, node, rate * world.time_s)
+
+
 HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
     make.__name__: make
     for make in (
@@ -167,5 +245,12 @@ HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
         nonlinear_convection,
         capacity_temperature,
         latent_heat,
+        input_step,
+        input_drift,
+        conductance_step,
+        conductance_temperature,
+        emissivity_step,
+        sensor_bias,
+        sensor_drift,
     )
 }

@@ -20,6 +20,8 @@ class Case:
     effect: str | None
     where: dict[str, Any]
     truth_K: np.ndarray
+    onset_s: float | None = None
+    onset_s: float | None = None
 
 
 def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: float = 60.0) -> Case:
@@ -32,6 +34,8 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
     read = truth if hidden.offset_K is None else truth + hidden.offset_K
     noise = float(rng.uniform(0.05, 0.15))
     unsensed = int(rng.integers(0, world.n)) if rng.random() < 0.3 else None
+    if hidden.where.get("sensor") == f"T{unsensed}":
+        unsensed = None
     channels: dict[str, Any] = {
         "T_room": {"kind": "temperature", "unit": "K"},
         "mode": {"kind": "auxiliary", "levels": True},
@@ -69,4 +73,4 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
             "loads": loads,
         }
     )
-    return Case(spec, Record(world.time_s, values, None, f"case-{seed}"), effect, hidden.where, truth)
+    return Case(spec, Record(world.time_s, values, None, f"case-{seed}"), effect, hidden.where, truth, hidden.onset_s)

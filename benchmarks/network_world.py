@@ -34,6 +34,8 @@ class Hidden:
         A relay: ``crossing(states)`` falls through zero where ``flip()`` is due.
     offset_K : (n_times, n_nodes)
         What the sensors read beyond the truth.
+    onset_s
+        When it sets in; None where it is there from the start.
     """
 
     where: dict[str, Any]
@@ -43,6 +45,7 @@ class Hidden:
     n_extra: int = 0
     switch: "Switch | None" = None
     offset_K: np.ndarray | None = None
+    onset_s: float | None = None
 
 
 @dataclass(frozen=True)
