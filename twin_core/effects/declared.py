@@ -67,16 +67,13 @@ def declared_conductor(effect: Effect, layout: Layout) -> tuple[PairConductor | 
 
 
 def radiator_places(layout: Layout) -> Iterable[Where]:
-    """Yield every node and sink between which a radiator is declared, each once."""
-    pairs = dict.fromkeys((radiator.node, radiator.sink) for radiator in layout.spec.radiators)
-    yield from ({"node": node, "sink": sink} for node, sink in pairs)
+    """Yield every declared radiator."""
+    yield from ({"node": radiator.node, "sink": radiator.sink} for radiator in layout.spec.radiators)
 
 
-def declared_radiators(effect: Effect, layout: Layout) -> list[tuple[SinkRadiation, str]]:
-    """Return the radiators at the effect's place with the names of their areas; ModelError if none is declared."""
+def declared_radiator(effect: Effect, layout: Layout) -> tuple[SinkRadiation, str]:
+    """Return the radiator at the effect's place and the name of its area; ModelError if none is declared."""
     node, sink = effect.where["node"], effect.where["sink"]
-    positions = [i for i, r in enumerate(layout.spec.radiators) if (r.node, r.sink) == (node, sink)]
-    if not positions:
+    if effect.where not in list(radiator_places(layout)):
         raise ModelError(f"effect {effect.name}: no radiator from '{node}' to '{sink}' is declared")
-    term = SinkRadiation(layout.node(node), layout.boundary(sink), ())
-    return [(term, radiator_name(layout.spec, i)) for i in positions]
+    return SinkRadiation(layout.node(node), layout.boundary(sink), ()), radiator_name(node, sink)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 
 from twin_core.effects.base import Quality, Where
-from twin_core.effects.declared import Changed, declared_radiators, radiator_places
+from twin_core.effects.declared import Changed, declared_radiator, radiator_places
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
 
@@ -19,10 +19,10 @@ class EmissivityStep(OnsetEffect):
     amplitude = Quality("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:
-        """Return the change of every radiator that is declared between the node and the sink."""
-        radiators = declared_radiators(self, layout)
-        terms = tuple(Changed(radiator, self.change, self.parameters(), (name,)) for radiator, name in radiators)
-        return Addition(terms, dated=self.settings["dated"])
+        """Return the change of the declared radiator."""
+        radiator, name = declared_radiator(self, layout)
+        term = Changed(radiator, self.change, self.parameters(), (name,))
+        return Addition((term,), dated=self.settings["dated"])
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:

@@ -34,7 +34,8 @@ class OnsetEffect(Effect):
         """Return the share that has set in, from 0 to 1, and its derivative by the onset."""
         width = self.settings["width_s"]
         share = (clock_s - time_s) / width + 0.5
-        return np.clip(share, 0.0, 1.0), np.where((share >= 0.0) & (share <= 1.0), -1.0 / width, 0.0)
+        within = np.heaviside(share, 0.5) - np.heaviside(share - 1.0, 0.5)
+        return np.clip(share, 0.0, 1.0), -within / width
 
     def change(self, clock_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
         """Return a factor f from the onset on, less one, and its derivatives by f and the onset; values are both."""

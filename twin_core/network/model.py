@@ -131,11 +131,9 @@ def gain_name(load: Load) -> str:
     return f"gain:{load.channel}|{load.node}"
 
 
-def radiator_name(spec: TwinSpec, i: int) -> str:
-    """Return the name of the exchange area of a declared radiator, such as ``R:px|space``; numbered if not the first."""
-    node, sink = spec.radiators[i].node, spec.radiators[i].sink
-    repeated = any((r.node, r.sink) == (node, sink) for r in spec.radiators[:i])
-    return f"R:{node}|{sink}" + (f"#{i}" if repeated else "")
+def radiator_name(node: str, sink: str) -> str:
+    """Return the name of the exchange area of a declared radiator, such as ``R:px|space``."""
+    return f"R:{node}|{sink}"
 
 
 def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -> Parameter:
@@ -297,9 +295,9 @@ def _declared_terms(layout: Layout) -> list[Term]:
             node = next(end for end in conductor.between if end not in layout.boundaries)
             parameter = _conductance(conductor.between, conductor.conductance_W_per_K)
             terms.append(BoundaryConductor(layout.node(node), layout.boundary(outer[0]), (parameter,)))
-    for i, radiator in enumerate(spec.radiators):
+    for radiator in spec.radiators:
         area = radiator.emissivity * radiator.area_m2
-        parameter = positive(radiator_name(spec, i), "m2", area, frozen=True)
+        parameter = positive(radiator_name(radiator.node, radiator.sink), "m2", area, frozen=True)
         terms.append(SinkRadiation(layout.node(radiator.node), layout.boundary(radiator.sink), (parameter,)))
     terms += [_load_term(layout, load) for load in spec.loads]
     return terms
