@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable, Mapping
 
+import numpy as np
+
 from replay.errors import MappingError
 from replay.recording import Recording
 
@@ -53,7 +55,9 @@ def _same_name(topic: str, channels: list[str]) -> str | None:
 
 
 def apply_mapping(recording: Recording, mapping: Mapping[str, str]) -> Recording:
-    """Return the recording with its columns named by channel, unmapped ones dropped."""
+    """Return the recording with its columns named by channel, unmapped ones and instants without a value dropped."""
     columns = {channel: recording.columns[topic] for topic, channel in mapping.items()}
     units = {channel: recording.units[topic] for topic, channel in mapping.items() if topic in recording.units}
-    return Recording(recording.time_ns, columns, units, recording.metadata)
+    seen = np.logical_or.reduce([~np.isnan(column) for column in columns.values()])
+    columns = {channel: column[seen] for channel, column in columns.items()}
+    return Recording(recording.time_ns[seen], columns, units, recording.metadata)

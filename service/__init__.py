@@ -1,0 +1,1 @@
+"""The service: telemetry in; state, forecasts, anomalies, better models and a dashboard out."""

@@ -94,12 +94,15 @@ def create_app(
         title="thermal-twin",
         version="1",
         lifespan=lifespan,
+        docs_url=None,  # by a route of our own, with files of our own
+        redoc_url=None,
         description="A digital twin of a spacecraft's temperatures that knows what it does not know.",
     )
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
-    app.mount("/assets", dashboard.assets, name="assets")
+    for path, files in dashboard.assets().items():
+        app.mount(path, files, name=path)
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Gate, keys=settings.roles)
     app.add_middleware(Observe, metrics=metrics)

@@ -5,7 +5,7 @@ import zlib
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.problems import Problem, problem
+from service.problems import BadField, Problem, problem
 
 LEAST_RATE_BYTES_PER_S = 32 * 1024
 DRAIN_FACTOR = 5
@@ -29,7 +29,9 @@ class Bodies:
             body = await self._read(headers, receive)
             body = _decode(body, headers.get(b"content-encoding", b"identity"), self._max_bytes)
         except Problem as error:
-            await problem(error.status, error.detail, headers={"Connection": "close"})(scope, receive, send)
+            await problem(error.status, error.detail, error.errors, headers={"Connection": "close"})(
+                scope, receive, send
+            )
             return
         except _Gone:
             return
@@ -110,9 +112,9 @@ def _decode(body: bytes, encoding: bytes, max_bytes: int) -> bytes:
     try:
         plain = decoder.decompress(body, max_bytes + 1)
     except zlib.error:
-        raise Problem(400, "the body is not valid gzip") from None
+        raise BadField("body", "is not valid gzip", 400) from None
     if len(plain) > max_bytes:
         raise Problem(413, f"the body is larger than {max_bytes} bytes after decompression; send smaller batches")
     if not decoder.eof or decoder.unused_data:
-        raise Problem(400, "the body is not one complete gzip stream")
+        raise BadField("body", "is not one complete gzip stream", 400)
     return plain

@@ -18,6 +18,7 @@ from service.workbench import (
     Progress,
     Telemetry,
 )
+from twin_core.errors import ModelError
 
 
 class CoreWorkbench:
@@ -40,8 +41,8 @@ class CoreWorkbench:
         rmse_K = _rmse_K(model, held)
         rival = None if task.rival is None or held is None else _rmse_K(_model_of(task.rival), held)
         validation = {
-            "rmse_K": rmse_K if rmse_K is not None else model.summary.get("rmse_K"),
-            "on": "recent data held back" if rmse_K is not None else "the training data: too few to hold any back",
+            "rmse_K": rmse_K if held is not None else model.summary.get("rmse_K"),
+            "on": "recent data held back" if held is not None else "the training data: too few to hold any back",
             "samples": int(recent.time_us.size),
         }
         return _outcome(model, validation, rival)
@@ -84,6 +85,8 @@ class CoreWorkbench:
 
         model = _cached_model(document)
         done = assimilate(model, _record(model.spec, telemetry), state)
+        if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
+            raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
         return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:

@@ -16,6 +16,9 @@ from twin_core.errors import TwinError
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("service")
 
+_UNREADABLE = "There was an error parsing the body"
+"""What FastAPI says of a body that its parser cannot cope with, such as one that is nested too deeply."""
+
 FieldErrors = Sequence[tuple[str, str]]
 
 
@@ -68,6 +71,8 @@ async def _on_http(request: Request, error: Exception) -> Response:
     detail = error.detail
     if error.status_code == 404 and detail == "Not Found":
         detail = f"no such resource: {request.url.path}"
+    elif error.status_code == 400 and detail == _UNREADABLE:
+        return problem(400, "body: not valid JSON", [("body", "not valid JSON")])
     elif error.status_code == 405:
         detail = f"{request.method} is not possible here"
     return problem(error.status_code, str(detail), headers=error.headers)

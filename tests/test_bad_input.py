@@ -32,7 +32,9 @@ def edit(*path: str | int, to: Any = DELETED) -> Edit:
 
 SPECIFICATIONS: list[tuple[Edit, str]] = [
     (edit("twin"), "twin: is missing"),
-    (edit("twin", to="Bench Sat"), "twin: is no valid name"),
+    (edit("twin", to="Bench Sat"), "twin: is no valid id; begin with a lower-case letter or digit"),
+    (edit("twin", to="-sat"), "twin: is no valid id; begin with a lower-case letter or digit"),
+    (edit("twin", to="s" * 64), "63 at most"),
     (edit("twin", to=7), "twin: must be text"),
     (edit("colour", to="red"), "colour: unknown field"),
     (edit("channels"), "channels: is missing"),
@@ -158,6 +160,14 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("simulate --scenario spec.yaml --out x.png", "x.png: the name must end in .csv or .mcap"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 1.5", "--holdout must be between 0 and 1"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --holdout half", "--holdout"),
+    (
+        "close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 0.9999",
+        "data.csv: a hold-out of 0.9999 leaves 1 sample to train on",
+    ),
+    (
+        "close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 0.01",
+        "data.csv: a hold-out of 0.01 leaves 1 sample to predict",
+    ),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --burn-in 9", "--burn-in belongs to"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out data.csv", "--out data.csv is a file"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --false-alarm-rate 2", "--false-alarm-rate must be"),
@@ -198,11 +208,19 @@ MODELS: list[tuple[Edit, str]] = [
     (edit("format", to="something else"), "format: not a model file"),
     (edit("values"), "values: is missing"),
     (edit("values", "C:a"), "values.C:a: is missing"),
-    (edit("values", "C:a", to="big"), "model file is damaged"),
+    (edit("values", "C:a", to="big"), "values.C:a: must be a number; the model file is damaged"),
     (edit("values", "C:a", to=float("nan")), "values.C:a: is not a finite number"),
-    (edit("covariance", to=[[1.0]]), "model file is damaged"),
+    (edit("covariance", to=[[1.0]]), "covariance: must be a square of numbers"),
     (edit("noise_K", "T_a"), "T_a: is missing"),
-    (edit("spec", "twin", to="!"), "twin: is no valid name"),
+    (edit("spec", "twin", to="!"), "twin: is no valid id"),
+    (edit("spec", to=None), "spec: must be a mapping; the model file is damaged"),
+    (edit("spec", to="benchsat"), "spec: must be a mapping; the model file is damaged"),
+    (edit("values", to="many"), "values: must be a mapping; the model file is damaged"),
+    (edit("free_names", to="C:a"), "free_names: must be a list; the model file is damaged"),
+    (edit("max_step_s", to="long"), "max_step_s: must be a number; the model file is damaged"),
+    (edit("noise_K", "T_a", to=[1]), "noise_K.T_a: must be a number; the model file is damaged"),
+    (edit("summary", to=3), "summary: must be a mapping; the model file is damaged"),
+    (edit("table_knots", to=[3]), "table_knots[0]: must be a mapping; the model file is damaged"),
     (edit("effects", to=[{"effect": "gremlins", "where": {"node": "a"}}]), "gremlins"),
 ]
 
@@ -210,6 +228,9 @@ PLANS: list[tuple[str, str]] = [
     ("time,Q_z\n2026-01-01T00:40:00Z,5\n", "plan.csv: has columns that the specification does not name: Q_z"),
     ("time,T_a\n2026-01-01T00:40:00Z,5\n", "plan.csv: plans no input"),
     ("time_s,Q_a\n5,5\n", "plan.csv: must write time in the form of data.csv"),
+    ("time,Q_a\n2026-01-01T00:40:00Z,\n", "plan.csv: plans no value of Q_a"),
+    ("time,Q_a\n2026-01-01T00:20:00Z,5\n", "plan.csv: ends at 2026-01-01T00:20:00Z, before the forecast begins"),
+    ("time,Q_a\n2026-01-02T00:00:00Z,5\n", "plan.csv: begins at 2026-01-02T00:00:00Z, after the forecast ends"),
     ("time,Q_a\n2026-01-01T00:40:00Z,much\n", "plan.csv: row 2: column 'Q_a' holds 'much'"),
 ]
 

@@ -52,7 +52,7 @@ def forecast(
     record = load_record(telemetry[0], model.spec)
     if step is None and record.time_s.size < 2:
         raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
-    planned = _load_plan(plan, record, model) if plan else None
+    planned = _load_plan(plan, record, model, horizon) if plan else None
     result = look_ahead(model, record, horizon, step_s=step, plan=planned)
     document = _document(result, record, model)
     _write(out, document)
@@ -63,7 +63,7 @@ def forecast(
         print_line(f"{out}: {len(result.time_s)} instants of {len(result.sensors)} sensors")
 
 
-def _load_plan(path: Path, record: "Record", model: "CalibratedModel") -> "Record":
+def _load_plan(path: Path, record: "Record", model: "CalibratedModel", horizon_s: float) -> "Record":
     """Return the planned inputs on the time axis of the record."""
     from dataclasses import replace
 
@@ -79,7 +79,28 @@ def _load_plan(path: Path, record: "Record", model: "CalibratedModel") -> "Recor
     if (plan.epoch_ns is None) != (record.epoch_ns is None):
         raise TelemetryError(f"{path}: must write time in the form of {record.name} (dates or seconds)")
     shift_s = 0.0 if plan.epoch_ns is None or record.epoch_ns is None else (plan.epoch_ns - record.epoch_ns) / 1e9
-    return replace(plan, time_s=plan.time_s + shift_s, epoch_ns=record.epoch_ns)
+    shifted = replace(plan, time_s=plan.time_s + shift_s, epoch_ns=record.epoch_ns)
+    _check_plan(shifted, inputs, float(record.time_s[-1]), horizon_s)
+    return shifted
+
+
+def _check_plan(plan: "Record", inputs: list[str], now_s: float, horizon_s: float) -> None:
+    """Refuse a plan that would change nothing."""
+    import numpy as np
+
+    from twin_core.errors import TelemetryError
+
+    empty = [name for name in inputs if not np.isfinite(plan.values[name]).any()]
+    if empty:
+        raise TelemetryError(f"{plan.name}: plans no value of {', '.join(empty)}; give some or leave the column out")
+    first_s, last_s = float(plan.time_s[0]), float(plan.time_s[-1])
+    if last_s < now_s:
+        raise TelemetryError(
+            f"{plan.name}: ends at {plan.present(last_s)}, before the forecast begins at {plan.present(now_s)}"
+        )
+    if np.isfinite(horizon_s) and first_s > now_s + horizon_s:
+        end = plan.present(now_s + horizon_s)
+        raise TelemetryError(f"{plan.name}: begins at {plan.present(first_s)}, after the forecast ends at {end}")
 
 
 def _document(result: "Forecast", record: "Record", model: "CalibratedModel") -> dict[str, Any]:

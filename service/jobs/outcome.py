@@ -25,17 +25,24 @@ class Finished:
     activate: bool | None
 
 
+@dataclass(frozen=True)
+class Decision:
+    """Whether a new model becomes the active one, and why."""
+
+    activate: bool
+    reason: str
+
+
 def save(connection: sqlite3.Connection, twin: int, finished: Finished) -> tuple[int | None, Sequence[Stretch]]:
     """Store version, activation and result in one transaction; return the version that is active now if it changed."""
     if finished.kind == "diagnosis" and not (finished.outcome.report or {}).get("findings"):
-        return None, _end(connection, twin, finished, None, None)
+        return None, _end(connection, twin, finished, None, Decision(False, "nothing was found to add"))
     version = models.add(connection, twin, finished.kind, _summary(finished), finished.outcome.document)
-    reason = _reason_to_activate(connection, twin, finished)
-    if reason is not None:
-        models.activate(connection, twin, version, reason)
+    decision = _decide(connection, twin, finished)
+    if decision.activate:
+        models.activate(connection, twin, version, decision.reason)
     _explain(connection, twin, finished)
-    stretches = _end(connection, twin, finished, version, reason)
-    return (version if reason is not None else None), stretches
+    return (version if decision.activate else None), _end(connection, twin, finished, version, decision)
 
 
 def _summary(finished: Finished) -> Json:
@@ -70,35 +77,46 @@ def _sensors_at(specification: Json, where: Json) -> list[str]:
     return sorted(found)
 
 
-def _reason_to_activate(connection: sqlite3.Connection, twin: int, finished: Finished) -> str | None:
-    """Return why the new model becomes the active one, or None if it does not."""
+def _decide(connection: sqlite3.Connection, twin: int, finished: Finished) -> Decision:
+    """Return whether the new model becomes the active one, and why."""
     if finished.activate is not None:
-        return "requested" if finished.activate else None
-    if finished.kind == "diagnosis":
-        return None
+        return Decision(finished.activate, "requested" if finished.activate else "not asked for")
     active = models.active(connection, twin)
     if active is None:
-        return "the first model"
+        return Decision(True, "the first model")
+    if active.version != finished.rival:
+        return Decision(False, f"version {active.version} was activated meanwhile")
     new, old = finished.outcome.validation.get("rmse_K"), finished.outcome.rival_rmse_K
-    if new is None or old is None or active.version != finished.rival or not new < old:
-        return None
-    return f"better on recent data: {new:.3g} K against {old:.3g} K of version {active.version}"
+    if new is None or old is None:
+        return Decision(False, "no recent data on which to compare it with the active one")
+    figures = f"on recent data: {new:.3g} K against {old:.3g} K of version {active.version}"
+    return Decision(new < old, f"{'better' if new < old else 'not better'} {figures}")
+
+
+def _message(finished: Finished, version: int | None, decision: Decision) -> str:
+    """Return the outcome in one line, what could not be scored included."""
+    if version is None:
+        return decision.reason
+    unscored = finished.outcome.validation.get("rmse_K") is None
+    score = "; its error is not known: the data held back hold no reading to compare with" if unscored else ""
+    return f"version {version} is {'active' if decision.activate else 'not active'}: {decision.reason}{score}"
 
 
 def _end(
-    connection: sqlite3.Connection, twin: int, finished: Finished, version: int | None, reason: str | None
+    connection: sqlite3.Connection, twin: int, finished: Finished, version: int | None, decision: Decision
 ) -> Sequence[Stretch]:
     outcome = finished.outcome
-    result: Json = {"model_version": version, "version": version, "activated": reason is not None}
+    result: Json = {"model_version": version, "version": version, "activated": decision.activate}
     if outcome.report is not None:
         result = {**outcome.report, **result}
     else:
-        result |= {"reason": reason, "validation": outcome.validation, "rival_rmse_K": outcome.rival_rmse_K}
-    if not jobs.finish(connection, finished.job, "succeeded", "done", result, outcome.page):
+        result |= {"reason": decision.reason, "validation": outcome.validation, "rival_rmse_K": outcome.rival_rmse_K}
+    message = _message(finished, version, decision)
+    if not jobs.finish(connection, finished.job, "succeeded", message, result, outcome.page):
         raise LookupError(f"job {finished.job} has ended already")
     messages: list[tuple[str, Json]] = []
     if version is not None:
-        messages.append(("model", {"version": version, "active": reason is not None, "source": finished.kind}))
+        messages.append(("model", {"version": version, "active": decision.activate, "source": finished.kind}))
     messages.append(("job", {"job": _brief(connection, twin, finished.kind, finished.job)}))
     return [EventStretch(tuple(events.append(connection, twin, now_us(), messages)))]
 

@@ -53,24 +53,43 @@ def build_task(twin: Entry, active: Active, position: Position, request: Forecas
         raise BadField("horizon_s", f"must be at most {longest_s:g} s for this model")
     telemetry = moment(twin, active, position)
     plan = None if request.plan is None else _plan(twin, request.plan, active.epoch_us)
+    if plan is not None:
+        _check_span(plan, position.time_us, position.time_us + round(request.horizon_s * 1e6))
     return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, tuple(request.quantiles))
 
 
 def _plan(twin: Entry, plan: Columns, epoch_us: int) -> Telemetry | None:
-    """Return the planned inputs in the order of time."""
+    """Return the planned inputs; None if no time is planned."""
     for name, column in plan.values.items():
         if name not in twin.channels:
             raise BadField(f"plan.values.{name}", f"unknown channel '{name}' (known: {', '.join(twin.channels)})")
+        if name in twin.sensors:
+            raise BadField(f"plan.values.{name}", "is what the forecast predicts; plan inputs and boundaries only")
         if len(column) != len(plan.time):
             raise BadField(f"plan.values.{name}", f"has {len(column)} values, time has {len(plan.time)}")
     time_us = parse_instants(plan.time, "plan.time")
     if time_us.size == 0:
         return None
-    order = np.argsort(time_us, kind="stable")
-    if (np.diff(time_us[order]) == 0).any():
-        raise BadField("plan.time", "names an instant twice")
-    values = {name: np.array(column, dtype=np.float64)[order] for name, column in plan.values.items()}
-    return Telemetry(epoch_us, time_us[order], values)
+    steps = np.diff(time_us)
+    if (steps <= 0).any():
+        index = int(np.argmax(steps <= 0)) + 1
+        raise BadField(
+            f"plan.time[{index}]", "does not come after the time before it; sort the plan, each instant once"
+        )
+    values = {name: np.array(column, dtype=np.float64) for name, column in plan.values.items()}
+    for name, planned in values.items():
+        if not np.isfinite(planned).any():
+            raise BadField(f"plan.values.{name}", "plans no value; give some or leave the channel out")
+    return Telemetry(epoch_us, time_us, values)
+
+
+def _check_span(plan: Telemetry, now_us: int, stop_us: int) -> None:
+    """Refuse a plan of another time than the forecast's."""
+    first_us, last_us = int(plan.time_us[0]), int(plan.time_us[-1])
+    if last_us < now_us:
+        raise BadField("plan.time", f"ends before the forecast begins at {format_instant(now_us)}")
+    if first_us > stop_us:
+        raise BadField("plan.time", f"begins after the forecast ends at {format_instant(stop_us)}")
 
 
 def quantile_name(probability: float) -> str:

@@ -18,7 +18,7 @@ from service.store.residuals import Residuals
 from service.store.samples import Samples
 
 BLOCK = 5000
-"""About so many samples are assimilated in one step."""
+"""At most so many samples are assimilated in one step."""
 
 Json = dict[str, Any]
 
@@ -75,8 +75,10 @@ def switch(connection: sqlite3.Connection, twin: Entry, version: int) -> Checkpo
     return checkpoints.before(connection, twin.key, version)
 
 
-def next_samples(connection: sqlite3.Connection, twin: Entry, position_us: int | None) -> Samples:
-    """Return about a block of samples from a position on, that sample included."""
-    stop_us = samples.block_stop(connection, twin.key, position_us, BLOCK)
+def next_samples(connection: sqlite3.Connection, twin: Entry, after_us: int | None, most: int) -> Samples:
+    """Return at most ``most`` samples after an instant."""
+    stop_us = samples.block_stop(connection, twin.key, after_us, most)
     n = len(twin.channels)
-    return samples.select(connection, twin.key, n, range(n), position_us, stop_us)
+    start_us = None if after_us is None else after_us + 1
+    found = samples.select(connection, twin.key, n, range(n), start_us, stop_us)
+    return Samples(found.time_us[:most], found.values[:, :most])

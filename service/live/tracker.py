@@ -16,10 +16,11 @@ from service.store import models
 from service.store.anomalies import Change
 from service.store.checkpoints import Checkpoint
 from service.store.database import Database
+from service.store.gone import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
-from service.workbench import Telemetry
+from service.workbench import Filtered, Telemetry
 from twin_core.anomaly import detect
 from twin_core.errors import TwinError
 
@@ -65,6 +66,32 @@ class _News:
     model: bool = True
 
 
+@dataclass
+class _Caution:
+    """How the tracker gets past samples that cannot be assimilated.
+
+    A block that fails is tried again in halves, down to ``stride`` samples, which are skipped; each skip in a row
+    doubles the stride. A stretch of n such samples thus costs about 2 log2(n) attempts and at most n good samples.
+    """
+
+    most: int = progress.BLOCK
+    stride: int = 1
+    skipped_us: int | None = None
+
+    def failed(self, time_us: NDArray[np.int64]) -> bool:
+        """Hear that these samples failed; return whether they are skipped from now on."""
+        if time_us.size > self.stride:
+            self.most = max(int(time_us.size) // 2, self.stride)
+            return False
+        self.skipped_us = int(time_us[-1])
+        self.most = self.stride = min(2 * self.stride, progress.BLOCK)
+        return True
+
+    def succeeded(self) -> None:
+        """Hear that a block was assimilated."""
+        self.most, self.stride, self.skipped_us = min(2 * self.most, progress.BLOCK), 1, None
+
+
 class Tracker:
     """Keeps one twin's state up to date in the background."""
 
@@ -75,6 +102,7 @@ class Tracker:
         self.position: Position | None = None
         self.trouble: str | None = None
         self._database, self._hub, self._engine = database, hub, engine
+        self._caution = _Caution()
         self._news, self._wake, self._idle = _News(), asyncio.Event(), asyncio.Event()
         self._wake.set()
         self._task = asyncio.create_task(self._run())
@@ -113,12 +141,8 @@ class Tracker:
             news, self._news = self._news, _News(model=False)
             try:
                 await self._take_in(news)
-                self.trouble = None
-            except LookupError:
-                return  # the twin was deleted
-            except TwinError as error:
-                self.trouble = str(error)
-                log.warning("assimilation failed", extra={"twin": self.twin.name, "reason": self.trouble})
+            except TwinGone:
+                return
             except Exception as error:
                 self.trouble = f"{type(error).__name__}: {error}"
                 log.exception("assimilation failed unexpectedly", extra={"twin": self.twin.name})
@@ -133,6 +157,9 @@ class Tracker:
             await self._load()
         if self.active is None:
             return
+        skipped_us = self._caution.skipped_us
+        if skipped_us is not None and any(t.min() <= skipped_us for t in news.times):
+            self._caution = _Caution()
         late = [t for t in news.times if self.position is not None and t.min() <= self.position.time_us]
         if late:
             await self._go_back(int(min(t.min() for t in late)))
@@ -149,6 +176,7 @@ class Tracker:
         if self.active is not None and self.active.version == active.version:
             return
         checkpoint = await self._database.write(progress.switch, self.twin, active.version)
+        self._caution, self.trouble = _Caution(), None
         self.position = None if checkpoint is None else Position.of(checkpoint)
         self.active = active
 
@@ -159,47 +187,72 @@ class Tracker:
 
     async def _advance(self, told: NDArray[np.int64]) -> bool:
         """Assimilate the next block; return whether there may be more."""
-        active, before = self.active, self.position
+        active, before, caution = self.active, self.position, self._caution
         assert active is not None
-        start_us = None if before is None else before.time_us
-        found = await self._database.read(progress.next_samples, self.twin, start_us)
-        fresh = slice(0 if before is None else 1, None)
-        if found.time_us[fresh].size == 0:
+        known_us = None if before is None else before.time_us
+        start_us = known_us if caution.skipped_us is None else caution.skipped_us
+        fresh = await self._database.read(progress.next_samples, self.twin, start_us, caution.most)
+        if fresh.time_us.size == 0:
             return False
-        telemetry, held = _telemetry(self.twin, found, active.epoch_us, {} if before is None else before.held)
-        done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
-        innovation, std = done.innovation_K[fresh], done.innovation_std_K[fresh]
-        time_us, nis = found.time_us[fresh], done.nis[fresh]
+        telemetry, held = _telemetry(self.twin, fresh, active.epoch_us, before)
+        try:
+            done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
+        except (TwinError, ArithmeticError, ValueError) as error:
+            self.trouble = str(error)
+            if caution.failed(fresh.time_us):
+                extra = {"twin": self.twin.name, "reason": self.trouble, "samples": int(fresh.time_us.size)}
+                log.warning("samples that cannot be assimilated are skipped", extra=extra)
+            return True
+        caution.succeeded()
+        self.trouble = None
+        await self._keep(active, before, fresh.time_us, done, held, told)
+        return True
+
+    async def _keep(
+        self,
+        active: Active,
+        before: Position | None,
+        time_us: NDArray[np.int64],
+        done: Filtered,
+        held: dict[str, float],
+        told: NDArray[np.int64],
+    ) -> None:
+        """Look for anomalies in an assimilated block and write everything down."""
+        new = slice(-time_us.size, None)
+        innovation, std, nis = done.innovation_K[new], done.innovation_std_K[new], done.nis[new]
         detector, intervals = detect(
             None if before is None else before.detector, done.sensors, time_us, innovation, std
         )
         changes = [Change(i.sensor, "residual", i.start, i.stop, i.score) for i in intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
-        sampling_s = _sampling_s(found.time_us, before)
-        after = Position(int(time_us[-1]), count, done.state, held, detector, sampling_s)
+        after = Position(int(time_us[-1]), count, done.state, held, detector, _sampling_s(time_us, before))
         step = Step(active.version, time_us, innovation, std, nis, np.isin(time_us, told), changes, after.checkpoint())
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
         self.position = after
-        return True
 
 
 def _telemetry(
-    twin: Entry, found: Samples, epoch_us: int, held: dict[str, float]
+    twin: Entry, fresh: Samples, epoch_us: int, before: Position | None
 ) -> tuple[Telemetry, dict[str, float]]:
-    """Return a block for the filter, with inputs that were last seen before it, and the inputs that hold at its end."""
+    """Return a block for the filter and the inputs that hold at its end.
+
+    It opens with the sample that the state knows already, of which only the inputs matter.
+    """
+    held = {} if before is None else before.held
+    known = 0 if before is None else 1
     values: dict[str, NDArray[np.float64]] = {}
     after = dict(held)
     for row, name in enumerate(twin.channels):
-        column = found.values[row].copy()
-        if name not in twin.sensors:
-            if np.isnan(column[0]) and name in held:
-                column[0] = held[name]
-            seen = np.flatnonzero(np.isfinite(column))
-            if seen.size:
-                after[name] = float(column[seen[-1]])
-        if name in twin.sensors or np.isfinite(column).any():
+        is_sensor = name in twin.sensors
+        first = np.full(known, np.nan if is_sensor else held.get(name, np.nan))
+        column = np.concatenate([first, fresh.values[row]])
+        seen = np.flatnonzero(np.isfinite(column))
+        if seen.size and not is_sensor:
+            after[name] = float(column[seen[-1]])
+        if is_sensor or seen.size:
             values[name] = column
-    return Telemetry(epoch_us, found.time_us, values), after
+    known_us = [] if before is None else [before.time_us]
+    return Telemetry(epoch_us, np.concatenate([np.array(known_us, dtype=np.int64), fresh.time_us]), values), after
 
 
 def _sampling_s(time_us: NDArray[np.int64], before: Position | None) -> float:

@@ -38,16 +38,19 @@ def _looking(kind: JobKind, router: APIRouter) -> None:
 
     @router.get("", dependencies=[reads], summary=f"List every {kind}, the newest first")
     async def list_jobs(service: Running, twin: NamedTwin) -> JobList:
+        """Return the jobs of one kind."""
         rows = await service.database.read(jobs.select, twin.key, kind)
         return JobList(jobs=[Job(**row.wire()) for row in rows])
 
     @router.get("/{job}", dependencies=[reads], summary=f"Look at one {kind}")
     async def inspect(service: Running, twin: NamedTwin, job: str) -> Job:
+        """Return state, progress and result."""
         row = await service.database.read(jobs.get, twin.key, kind, job)
         return Job(**row.wire())
 
     @router.delete("/{job}", dependencies=[operates], summary=f"Cancel a {kind}; one that has ended stays as it is")
     async def cancel(service: Running, twin: NamedTwin, job: str) -> Job:
+        """End the process of a job that runs; return the job as it stands then."""
         row = await service.jobs.cancel(twin, kind, job)
         return Job(**row.wire())
 

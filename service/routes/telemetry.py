@@ -19,6 +19,7 @@ from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Archive, Columns, IngestReport
 from service.store import samples
+from service.store.gone import TwinGone
 from service.store.samples import Receipt, Samples
 
 router = APIRouter(prefix="/v1/twins/{twin}/telemetry", tags=["telemetry"])
@@ -52,7 +53,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     _refuse_implausible(entry, batch)
     try:
         receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
-    except LookupError:
+    except TwinGone:
         raise Problem(404, f"no twin '{twin}' is registered") from None
     if accepted.size:
         service.live.arrived(entry, accepted)
@@ -98,7 +99,7 @@ def _report(receipt: Receipt, n_accepted: int) -> dict[str, Any]:
     return {
         "accepted": n_accepted,
         "duplicates": receipt.duplicates,
-        "rejected": [{"index": index, "reason": "conflict"} for index in receipt.conflicts],
+        "rejected": [{"index": index, "reason": reason} for index, reason in receipt.rejected],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
 

@@ -7,6 +7,8 @@ from typing import Any
 
 import orjson
 
+from service.store.gone import TwinGone
+
 
 @dataclass(frozen=True)
 class Event:
@@ -22,7 +24,7 @@ def claim(connection: sqlite3.Connection, twin: int, count: int) -> int:
     """Reserve ``count`` consecutive numbers of a twin's stream; return the first."""
     row = connection.execute("UPDATE head SET seq = seq + ? WHERE twin = ? RETURNING seq", (count, twin)).fetchone()
     if row is None:
-        raise LookupError(f"twin {twin} is gone")
+        raise TwinGone(f"twin {twin} is gone")
     return int(row[0]) - count + 1
 
 

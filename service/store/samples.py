@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.frames import Batch
-from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, collapse, merge
+from service.store.gone import TwinGone
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, EMPTY, collapse, merge
 
 SMALL = 512
 """Chunks with fewer rows than this are compacted."""
@@ -41,9 +42,10 @@ class Receipt:
         return int(np.count_nonzero(self.status == DUPLICATE))
 
     @property
-    def conflicts(self) -> list[int]:
-        """Where the samples stand that contradict the archive."""
-        return np.flatnonzero(self.status == CONFLICT).tolist()
+    def rejected(self) -> list[tuple[int, str]]:
+        """Where the samples stand that were not taken in, and why: they contradict the archive, or hold no value."""
+        positions = np.flatnonzero(self.status >= CONFLICT)
+        return [(i, "conflict" if self.status[i] == CONFLICT else "empty") for i in positions.tolist()]
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,9 @@ class Samples:
 def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
+    empty: NDArray[np.bool_] = np.isnan(batch.values).all(axis=0)
+    if empty.any():
+        return _without(connection, twin, batch, empty)
     if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
         head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
         if head is not None:
@@ -65,11 +70,19 @@ def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     return _merge_in(connection, twin, batch)
 
 
+def _without(connection: sqlite3.Connection, twin: int, batch: Batch, empty: NDArray[np.bool_]) -> Receipt:
+    """Store a batch without its samples that hold no value."""
+    receipt = append(connection, twin, Batch(batch.time_us[~empty], batch.values[:, ~empty]))
+    status = np.full(empty.size, EMPTY, dtype=np.int8)
+    status[~empty] = receipt.status
+    return Receipt(status, receipt.first_seq, receipt.last_us)
+
+
 def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch that is late, unordered or empty."""
     row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
-        raise LookupError(f"twin {twin} is gone")
+        raise TwinGone(f"twin {twin} is gone")
     if batch.time_us.size == 0:
         return Receipt(np.empty(0, dtype=np.int8), row[0] + 1, row[1])
     fate = merge(*_around(connection, twin, batch), batch.time_us, batch.values)
@@ -79,7 +92,7 @@ def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receip
     stored = Batch(batch.time_us[kept], batch.values[:, kept])
     head = _advance(connection, twin, stored, fate.n_instants, after_all=False)
     if head is None:
-        raise LookupError(f"twin {twin} is gone")
+        raise TwinGone(f"twin {twin} is gone")
     _write(connection, twin, stored, head)
     return Receipt(fate.status, row[0] + 1, max(int(stored.time_us.max()), row[1] or 0))
 

@@ -1,9 +1,11 @@
 """Which topic feeds which channel."""
 
+import numpy as np
 import pytest
 
 from replay.errors import MappingError
-from replay.mapping import map_topics
+from replay.mapping import apply_mapping, map_topics
+from replay.recording import Recording
 
 CHANNELS = ["T_px", "Q_px"]
 
@@ -15,6 +17,12 @@ def test_last_part_of_a_topic_names_the_channel(topic: str) -> None:
 
 def test_rename_goes_before_the_name() -> None:
     assert map_topics(["T_px", "a"], CHANNELS, {"a": "Q_px"}) == {"T_px": "T_px", "a": "Q_px"}
+
+
+def test_instants_of_which_no_channel_knows_are_left_out() -> None:
+    columns = {"/T_px": np.array([1.0, np.nan, 3.0]), "camera": np.array([np.nan, 2.0, 2.0])}
+    mapped = apply_mapping(Recording(np.array([10, 20, 30]), columns), {"/T_px": "T_px"})
+    assert (mapped.time_ns.tolist(), mapped.columns["T_px"].tolist()) == ([10, 30], [1.0, 3.0])
 
 
 @pytest.mark.parametrize(

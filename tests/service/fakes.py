@@ -20,13 +20,15 @@ from service.workbench import (
 from twin_core.errors import ModelError
 
 SENSORS = ("T_px", "T_tank")
+UNFIT = 666.0
+"""A reading that the fake filter cannot assimilate."""
 
 
 class FakeWorkbench:
     """Calibrates to a given error, crashes or dawdles when a channel says so.
 
-    The mean of ``Q_px`` chooses what a calibration does: 13 dies, 14 raises, 15 refuses, 16 runs for ever, anything
-    else is the RMSE in K that the new model claims on recent data.
+    The mean of ``Q_px`` chooses what a calibration does: 13 dies, 14 raises, 15 refuses, 16 runs for ever, 17 cannot be
+    scored, anything else is the RMSE in K that the new model claims on recent data.
     """
 
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
@@ -69,8 +71,12 @@ class FakeWorkbench:
         if "poison" in document and not Path(document[document.index("/") :].split('"')[0]).exists():
             os.kill(os.getpid(), 9)
         read = np.stack([telemetry.values[s] for s in SENSORS], axis=1)
+        if (read == UNFIT).any():
+            raise ModelError("the filter cannot make sense of a reading")
         before = np.array(state["last"]) if state else read[0]
         before = np.where(np.isnan(before), 0.0, before)
+        if state:
+            read[0] = before
         innovation = np.diff(read, axis=0, prepend=before[None, :])
         last = np.where(np.isnan(read[-1]), before, read[-1])
         nis = np.nansum(innovation**2, axis=1)
@@ -96,4 +102,4 @@ def _outcome(specification: Json, rmse_K: float, rival: float | None, samples: i
     stop = f"{np.datetime64(stop_us, 'us')}Z"
     train = {"start": "1970-01-01T00:00:00Z", "stop": stop, "samples": samples}
     document = {"spec": specification, "rmse_K": rmse_K, "max_step_s": 60.0}
-    return Outcome(document, train, {"rmse_K": rmse_K}, [], rival)
+    return Outcome(document, train, {"rmse_K": None if rmse_K == 17 else rmse_K}, [], rival)

@@ -98,6 +98,7 @@ def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
     page.press("?")
     page.until("document.getElementById('help-dialog').open")
     page.click("#help-dialog button")
+    page.until("!document.getElementById('help-dialog').open")
     page.click("#legend button")
     assert page.evaluate("document.querySelector('#legend button').getAttribute('aria-pressed')") == "false"
 
@@ -119,3 +120,12 @@ def test_a_key_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
             page.until("document.getElementById('link').dataset.state === 'live'")
             page.click("#calibrate")
             page.until("document.getElementById('toasts').innerText.includes('operate')")
+            assert server.client("o")._http.get("/v1/twins/benchsat/calibrations").json() == {"jobs": []}
+
+
+def test_the_description_of_the_api_needs_no_other_host(server: Server, page: Browser) -> None:
+    page.open(f"{server.url}/docs")
+    page.until("document.querySelectorAll('.opblock').length >= 20")
+    loaded = page.evaluate("performance.getEntriesByType('resource').map((entry) => entry.name)")
+    assert len(loaded) >= 3 and all(name.startswith((server.url, "data:")) for name in loaded)
+    assert page.troubles == []

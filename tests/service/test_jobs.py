@@ -73,6 +73,18 @@ def test_a_later_model_must_beat_the_active_one(client: AppClient, claim: float,
     assert [m["active"] for m in client.get(f"{TWIN}/models").json()["models"]] == [not wins, wins]
 
 
+def test_a_job_says_in_words_what_became_of_its_model(client: AppClient) -> None:
+    messages = []
+    for first, wish in ((0, 0.5), (1000, 0.4), (2000, 0.6), (3000, 17)):
+        feed(client, wish, first=first)
+        messages.append(finish(client, start(client))["message"])
+    assert messages[0] == "version 1 is active: the first model"
+    assert messages[1] == "version 2 is active: better on recent data: 0.4 K against 0.5 K of version 1"
+    assert messages[2] == "version 3 is not active: not better on recent data: 0.6 K against 0.4 K of version 2"
+    assert "not active: no recent data on which to compare" in messages[3]
+    assert "its error is not known" in messages[3]
+
+
 def test_without_new_data_nothing_can_be_beaten(client: AppClient) -> None:
     feed(client, 0.5)
     finish(client, start(client))

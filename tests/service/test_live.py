@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.service.conftest import SPEC
-from tests.service.fakes import FakeWorkbench
+from tests.service.fakes import UNFIT, FakeWorkbench
 from tests.service.harness import AppClient
 
 TWIN = "/v1/twins/benchsat"
@@ -87,6 +87,30 @@ def test_state_survives_a_restart(make_client) -> None:
     assert len(found) == 101 and found[-1] == SCALE_K * 199
 
 
+@pytest.mark.parametrize("unfit", [[105], [100, 101, 102, 109], list(range(100, 180))])
+def test_samples_that_cannot_be_assimilated_are_skipped(client: AppClient, unfit: list[int]) -> None:
+    squares(client)
+    times = list(range(100, 300))
+    send(client, times, [UNFIT if k in unfit else SCALE_K * 100 for k in times])
+    found = residuals(client)
+    assert not {f"1970-01-01T00:0{k // 60}:{k % 60:02d}Z" for k in unfit} & found.keys()
+    lost = 300 - len(found)
+    assert len(unfit) <= lost <= 2 * len(unfit)  # a stretch costs at most its own length of good samples after it
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).status_code == 200
+    send(client, [300], [SCALE_K * 101])
+    assert residuals(client)["1970-01-01T00:05:00Z"] == SCALE_K
+
+
+def test_an_archive_that_cannot_be_assimilated_says_why(client: AppClient) -> None:
+    send(client, list(range(100)), [UNFIT] * 100)
+    calibrate(client)
+    assert residuals(client) == {}
+    refused = client.get(f"{TWIN}/forecast", params={"horizon_s": 60})
+    assert refused.status_code == 409 and "cannot make sense of a reading" in refused.json()["detail"]
+    send(client, [100], [290.0])
+    assert list(residuals(client).values()) == [0.0]
+
+
 def test_another_model_has_residuals_of_its_own(client: AppClient) -> None:
     squares(client)
     calibrate(client)
@@ -104,7 +128,7 @@ def test_forecast_from_the_state(client: AppClient) -> None:
     assert found["values"]["T_px"] == {"mean": [7, 7, 7], "q05": [6.55] * 3, "q50": [7] * 3, "q95": [7.45] * 3}
     assert (found["model_version"], found["from"]) == (1, "1970-01-01T00:01:40Z")
     assert found["units"] == {"T_px": "K", "T_tank": "degC"}
-    plan = {"time": ["1970-01-01T00:02:00Z", 110], "values": {"Q_px": [5.0, 1.0]}}
+    plan = {"time": [110, "1970-01-01T00:02:00Z"], "values": {"Q_px": [1.0, 5.0]}}
     body = {"horizon_s": 60, "step_s": 60, "plan": plan, "quantiles": [0.975]}
     planned = client.post(f"{TWIN}/forecasts", json=body).json()
     assert planned["values"]["T_px"] == {"mean": [12.0], "q97.5": [12.475]}
@@ -128,7 +152,12 @@ WRONG_FORECASTS = (
     ({"horizon_s": 10, "quantiles": []}, "quantiles"),
     ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q": [1]}}}, "plan.values.Q"),
     ({"horizon_s": 10, "plan": {"time": [1], "values": {"Q_px": []}}}, "plan.values.Q_px"),
-    ({"horizon_s": 10, "plan": {"time": [1, 1], "values": {"Q_px": [1, 2]}}}, "plan.time"),
+    ({"horizon_s": 10, "plan": {"time": [99, 99], "values": {"Q_px": [1, 2]}}}, "plan.time[1]"),
+    ({"horizon_s": 10, "plan": {"time": [105, 102], "values": {"Q_px": [1, 2]}}}, "plan.time[1]"),
+    ({"horizon_s": 10, "plan": {"time": [99], "values": {"T_px": [290]}}}, "plan.values.T_px"),
+    ({"horizon_s": 10, "plan": {"time": [99, 100], "values": {"Q_px": [None, None]}}}, "plan.values.Q_px"),
+    ({"horizon_s": 10, "plan": {"time": [9, 98], "values": {"Q_px": [1, 2]}}}, "plan.time: ends before"),
+    ({"horizon_s": 10, "plan": {"time": [110, 120], "values": {"Q_px": [1, 2]}}}, "plan.time: begins after"),
     ({"horizon_s": 10, "plan": {"time": ["x"], "values": {"Q_px": [1]}}}, "plan.time[0]"),
 )
 

@@ -74,12 +74,25 @@ def test_channels_of_one_instant_may_come_apart(registered: AppClient) -> None:
 
 
 def test_frames_line_by_line_and_gzipped(registered: AppClient) -> None:
-    lines = [{"time": 10, "values": {"T_px": 1}}, {"time": "1970-01-01T00:00:20Z", "values": {"Q_px": None}}]
+    lines = [{"time": 10, "values": {"T_px": 1}}, {"time": "1970-01-01T00:00:20Z", "values": {"Q_px": 7, "T_px": None}}]
     body = "\n".join(map(json.dumps, lines)).encode() + b"\n\n"
     headers = {"content-type": "application/x-ndjson"}
     assert registered.post(ROUTE, content=body, headers=headers).json()["accepted"] == 2
     headers |= {"content-encoding": "gzip"}
     assert registered.post(ROUTE, content=gzip.compress(body), headers=headers).json()["duplicates"] == 2
+
+
+def test_samples_without_a_value_are_named_and_not_stored(registered: AppClient) -> None:
+    report = send(registered, [10, 20, 30], T_px=[None, 2, None], Q_px=[None, None, 3])
+    assert (report["accepted"], report["rejected"]) == (2, [{"index": 0, "reason": "empty"}])
+    report = send(registered, [20, 40, 20], T_px=[9, None, 2])
+    rejected = [{"index": 0, "reason": "conflict"}, {"index": 1, "reason": "empty"}]
+    assert (report["accepted"], report["duplicates"], report["rejected"]) == (0, 1, rejected)
+    headers = {"content-type": "application/x-ndjson"}
+    lines = b'{"time": 50, "values": {}}\n{"time": 60, "values": {"T_px": null}}\n{"time": 70, "values": {"T_px": 1}}'
+    report = registered.post(ROUTE, content=lines, headers=headers).json()
+    assert (report["accepted"], [item["index"] for item in report["rejected"]]) == (1, [0, 1])
+    assert registered.get(ROUTE).json()["values"]["T_px"] == [2, None, 1]
 
 
 def test_archive_of_a_part(registered: AppClient) -> None:

@@ -1,7 +1,7 @@
 """The calibrated model: numbers with their uncertainty, plain words about what the data cannot see, a JSON form."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -98,26 +98,28 @@ class CalibratedModel:
                 f"format: not a model file of this program (expected '{FORMAT}'); make one with twin calibrate"
             )
         try:
-            spec = load_spec(data["spec"])
-            free_names = tuple(str(name) for name in data["free_names"])
-            covariance = np.array(data["covariance"], dtype=np.float64).reshape(len(free_names), len(free_names))
+            spec = load_spec(_mapping(data["spec"], "spec"))
+            free_names = tuple(str(name) for name in _list(data["free_names"], "free_names"))
+            values = _mapping(data["values"], "values")
+            per_sensor = {
+                field_name: {
+                    s: _number(_mapping(data[field_name], field_name)[s], f"{field_name}.{s}") for s in spec.sensors
+                }
+                for field_name in ("noise_K", "misfit_K", "misfit_length_s")
+            }
             model = cls(
                 spec,
-                tuple(effect_from_json(item, i) for i, item in enumerate(data["effects"])),
-                {str(name): float(value) for name, value in data["values"].items()},
-                covariance,
+                tuple(effect_from_json(item, i) for i, item in enumerate(_list(data["effects"], "effects"))),
+                {str(name): _number(value, f"values.{name}") for name, value in values.items()},
+                _square(data["covariance"], len(free_names)),
                 free_names,
-                {s: float(data["noise_K"][s]) for s in spec.sensors},
-                {s: float(data["misfit_K"][s]) for s in spec.sensors},
-                {s: float(data["misfit_length_s"][s]) for s in spec.sensors},
-                float(data["max_step_s"]),
-                {(t["channel"], t["node"]): tuple(map(float, t["knots"])) for t in data["table_knots"]},
-                dict(data["summary"]),
+                **per_sensor,
+                max_step_s=_number(data["max_step_s"], "max_step_s"),
+                table_knots=dict(_knots(item, i) for i, item in enumerate(_list(data["table_knots"], "table_knots"))),
+                summary=dict(_mapping(data["summary"], "summary")),
             )
         except KeyError as error:
             raise SpecError(f"{error.args[0]}: is missing from the model file") from error
-        except (TypeError, ValueError, AttributeError) as error:
-            raise SpecError(f"the model file is damaged: {error}") from error
         model._check()
         return model
 
@@ -157,3 +159,36 @@ class CalibratedModel:
         for parameter in parameters.parameters:
             if is_logarithmic(parameter.transform) and not parameter.value > 0.0:
                 raise SpecError(f"values.{parameter.name}: must be positive")
+
+
+def _damaged(name: str, wanted: str) -> NoReturn:
+    raise SpecError(f"{name}: must be {wanted}; the model file is damaged")
+
+
+def _mapping(item: Any, name: str) -> Json:
+    return item if isinstance(item, dict) else _damaged(name, "a mapping")
+
+
+def _list(item: Any, name: str) -> list[Any]:
+    return item if isinstance(item, list) else _damaged(name, "a list")
+
+
+def _number(item: Any, name: str) -> float:
+    return float(item) if isinstance(item, int | float) and not isinstance(item, bool) else _damaged(name, "a number")
+
+
+def _square(item: Any, size: int) -> FloatArray:
+    """Return the covariance, (size, size)."""
+    rows = _list(item, "covariance")
+    flat = [_number(x, f"covariance[{i}]") for i, row in enumerate(rows) for x in _list(row, f"covariance[{i}]")]
+    if len(rows) != size or any(len(row) != size for row in rows):
+        _damaged("covariance", "a square of numbers, one row per name in free_names")
+    return np.array(flat, dtype=np.float64).reshape(size, size)
+
+
+def _knots(item: Any, position: int) -> tuple[tuple[str, str], tuple[float, ...]]:
+    """Return the place of a table and its levels."""
+    name = f"table_knots[{position}]"
+    table = _mapping(item, name)
+    knots = tuple(_number(x, f"{name}.knots") for x in _list(table["knots"], f"{name}.knots"))
+    return (str(table["channel"]), str(table["node"])), knots

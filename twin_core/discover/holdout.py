@@ -18,6 +18,7 @@ from twin_core.telemetry import Record
 
 DEFAULT_BURN_IN_SHARE = 0.05
 MIN_BURN_IN_SAMPLES = 10
+MIN_HELD_SAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,7 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
         elif kept <= 0.0:
             held.append(split_burn_in(record, None))
         else:
-            if before.sum() < MIN_BURN_IN_SAMPLES or (~before).sum() < 3:
-                raise TelemetryError(f"{record.name}: too few samples to hold {fraction:.0%} back")
+            _check_parts(record.name, fraction, int(before.sum()), int((~before).sum()))
             lead = record.take(before)
             train.append(lead)
             held.append(HeldOut(lead, record.take(np.arange(record.time_s.size) >= before.sum() - 1)))
@@ -79,6 +79,16 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
     if not train or not held:
         raise TelemetryError(f"holdout: {fraction:g} leaves nothing to train on or nothing to predict")
     return train, held
+
+
+def _check_parts(name: str, fraction: float, n_train: int, n_held: int) -> None:
+    """Refuse a cut that leaves either part too short."""
+    for count, least, purpose in ((n_train, MIN_BURN_IN_SAMPLES, "train on"), (n_held, MIN_HELD_SAMPLES, "predict")):
+        if count < least:
+            samples = f"{count} sample{'s' if count != 1 else ''}"
+            raise TelemetryError(
+                f"{name}: a hold-out of {fraction:g} leaves {samples} to {purpose}, {least} are needed; choose another"
+            )
 
 
 def split_burn_in(record: Record, burn_in_s: float | None) -> HeldOut:

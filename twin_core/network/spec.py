@@ -34,7 +34,9 @@ Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=Fal
 Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
 Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
 Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$")]
+_NAME = r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$"
+_TWIN_ID = r"^[a-z0-9][a-z0-9-]{0,62}$"
+Name = Annotated[str, Field(pattern=_NAME)]
 
 
 class _Strict(BaseModel):
@@ -206,7 +208,7 @@ class Criteria(_Strict):
 class TwinSpec(_Strict):
     """The whole specification of a twin (contract section 3)."""
 
-    twin: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,62}$")]
+    twin: Annotated[str, Field(pattern=_TWIN_ID)]
     boundaries: dict[Name, Boundary] = Field(default_factory=dict)
     channels: dict[Name, Channel]
     nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
@@ -334,7 +336,6 @@ _WORDING = {
     "too_short": "must hold more entries",
     "too_long": "must hold fewer entries",
     "string_type": "must be text",
-    "string_pattern_mismatch": "is no valid name; begin with a letter and use letters, digits, '_' and '-'",
     "float_parsing": "must be a number",
     "float_type": "must be a number",
     "bool_parsing": "must be true or false",
@@ -342,10 +343,19 @@ _WORDING = {
 }
 
 
+_PATTERN_WORDING = {
+    _NAME: "is no valid name; begin with a letter or '_' and go on with letters, digits and '_.:/-', 128 at most",
+    _TWIN_ID: "is no valid id; begin with a lower-case letter or digit and go on with those and '-', 63 at most",
+}
+
+
 def _wording(problem: Mapping[str, Any]) -> str:
     """Return what is wrong in words of the specification rather than of the validator."""
     kind, given = problem["type"], problem["input"]
-    message = _WORDING.get(kind, problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be"))
+    if kind == "string_pattern_mismatch":
+        message = _PATTERN_WORDING[problem["ctx"]["pattern"]]
+    else:
+        message = _WORDING.get(kind, problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be"))
     if kind in ("extra_forbidden", "missing", "value_error") or isinstance(given, dict | list):
         return message
     shown = repr(given)

@@ -54,11 +54,7 @@ export function drawJobs(list, jobs, { onCancel, onReport }) {
 
 function jobWords(job) {
   const { result } = job;
-  if (job.state !== "succeeded" || !result) return job.message;
-  if (job.kind === "calibration") {
-    const rmse = result.validation && result.validation.rmse_K !== null ? `, ${number(result.validation.rmse_K, 3)} K on recent data` : "";
-    return `version ${result.model_version}${rmse}; ${result.activated ? `active (${result.reason})` : "not activated: the active one is as good"}`;
-  }
+  if (job.state !== "succeeded" || !result || job.kind === "calibration") return job.message;
   const names = (result.findings || []).map(effectWords).join(", ");
   const verdict = { effect_added: names || "an effect was found", no_effect_supported: "nothing is missing that the data support", unexplained: "something is missing that has no name" };
   return `${verdict[result.verdict] || result.verdict}${result.model_version ? `; version ${result.model_version}` : ""}`;
