@@ -4,7 +4,6 @@ A message is ``{"value": number}``; a foreign file may carry several numeric fie
 becomes a column ``topic.field``. Viewers such as Foxglove, Lichtblick and PlotJuggler plot ``<topic>.value``.
 """
 
-import os
 import struct
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,15 +13,11 @@ import numpy as np
 import orjson
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from mcap.writer import Writer
 from numpy.typing import NDArray
 
 from replay.errors import RecordingError
+from replay.mcap_writer import VALUE, McapWriter
 from replay.recording import Recording, align
-
-METADATA_NAME = "thermal-twin"
-SCHEMA_NAME = "thermal_twin.Sample"
-VALUE = "value"
 
 Samples = dict[str, tuple[list[int], list[float]]]
 
@@ -57,15 +52,11 @@ def write_mcap(
     target = Path(path)
     recording = Recording(time_ns, columns, units or {}, metadata or {})
     _check_writable(target, recording)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as stream:
-            _write(stream, recording)
-        os.replace(partial, target)
-    except OSError as error:
-        raise RecordingError(f"{target}: cannot be written ({error.strerror or error})") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    with McapWriter(target, recording.columns, recording.units, recording.metadata) as writer:
+        rows = [(topic, column.tolist()) for topic, column in recording.columns.items()]
+        for row, instant_ns in enumerate(recording.time_ns.tolist()):
+            for topic, values in rows:
+                writer.add(topic, instant_ns, values[row])
 
 
 def _check_writable(target: Path, recording: Recording) -> None:
@@ -75,36 +66,6 @@ def _check_writable(target: Path, recording: Recording) -> None:
         if np.isinf(column).any():
             row = int(np.argmax(np.isinf(column))) + 1
             raise RecordingError(f"{target}: row {row}: channel '{name}' is infinite")
-
-
-def _write(stream: IO[bytes], recording: Recording) -> None:
-    writer = Writer(stream)
-    writer.start(profile="", library="thermal-twin")
-    if recording.metadata:
-        writer.add_metadata(METADATA_NAME, dict(recording.metadata))
-    channels = [(_add_channel(writer, topic, recording.units.get(topic)), topic) for topic in recording.columns]
-    columns = [(channel, recording.columns[topic].tolist()) for channel, topic in channels]
-    for row, instant_ns in enumerate(recording.time_ns.tolist()):
-        for channel, values in columns:
-            value = values[row]
-            if value == value:  # NaN, the missing sample, is the one number unequal to itself
-                data = b'{"value":%b}' % orjson.dumps(value)
-                writer.add_message(channel, instant_ns, data, publish_time=instant_ns, sequence=row)
-    writer.finish()
-
-
-def _add_channel(writer: Writer, topic: str, unit: str | None) -> int:
-    """Register one topic and its schema; return the channel's number."""
-    schema = {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": SCHEMA_NAME,
-        "type": "object",
-        "properties": {VALUE: {"type": "number", "description": f"{topic} in {unit}" if unit else topic}},
-        "required": [VALUE],
-    }
-    schema_id = writer.register_schema(SCHEMA_NAME, "jsonschema", orjson.dumps(schema))
-    metadata = {"unit": unit} if unit else {}
-    return int(writer.register_channel(topic, "json", schema_id, metadata))
 
 
 def read_mcap(path: Path | str) -> Recording:

@@ -8,6 +8,7 @@ import asyncio
 import random
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -20,6 +21,8 @@ from service.calls import Call, Values
 
 T = TypeVar("T", bound=BaseModel)
 
+STREAM_TIMEOUT = httpx.Timeout(30.0, read=60.0)
+"""A live stream says something every 15 s, so a minute of silence means that it is dead."""
 RETRIED = frozenset({408, 429, 502, 503, 504})
 
 
@@ -73,6 +76,14 @@ def _give_up(outcome: httpx.Response | httpx.TransportError, base_url: str, answ
     if isinstance(outcome, httpx.Response):
         return _read(outcome, answer)
     raise Unreachable(f"{base_url} does not answer ({outcome or type(outcome).__name__}); is the service running?")
+
+
+@contextmanager
+def _lost_is_unreachable(base_url: str) -> Iterator[None]:
+    try:
+        yield
+    except httpx.TransportError as error:
+        raise Unreachable(f"{base_url}: the stream broke off ({error or type(error).__name__})") from error
 
 
 def _event(line: str) -> schemas.Message | None:
@@ -233,9 +244,12 @@ class TwinClient:
         return self.send(calls.anomalies(name, parameters)).anomalies
 
     def events(self, name: str, after_seq: int | None = None) -> Iterator[schemas.Message]:
-        """Yield the messages of the stream, for as long as the connection lasts."""
+        """Yield the messages of the stream until the service ends it; Unreachable if the connection is lost."""
         parameters = {} if after_seq is None else {"after_seq": after_seq}
-        with self._http.stream("GET", f"/v1/twins/{name}/events", params=parameters, timeout=None) as response:
+        with (
+            _lost_is_unreachable(str(self._http.base_url)),
+            self._http.stream("GET", f"/v1/twins/{name}/events", params=parameters, timeout=STREAM_TIMEOUT) as response,
+        ):
             if not response.is_success:
                 response.read()
                 _read(response, schemas.Message)
@@ -288,6 +302,16 @@ class AsyncTwinClient:
         except httpx.TransportError as error:
             return error
 
+    async def twin(self, name: str) -> schemas.TwinDetail:
+        """Return one twin."""
+        return await self.send(calls.twin(name))
+
+    async def archive(
+        self, name: str, *, start: str | float | None = None, stop: str | float | None = None
+    ) -> schemas.Archive:
+        """Return a part of the archive."""
+        return await self.send(calls.archive(name, {"start": start, "stop": stop}))
+
     async def register(self, specification: Mapping[str, Any]) -> schemas.TwinDetail:
         """Register a specification."""
         return await self.send(calls.register(specification))
@@ -301,12 +325,14 @@ class AsyncTwinClient:
         return await self.send(calls.forecast(name, {"horizon_s": horizon_s, **request}))
 
     async def events(self, name: str, after_seq: int | None = None) -> AsyncIterator[schemas.Message]:
-        """Yield the messages of the stream, for as long as the connection lasts."""
+        """Yield the messages of the stream until the service ends it; Unreachable if the connection is lost."""
         parameters = {} if after_seq is None else {"after_seq": after_seq}
-        async with self._http.stream("GET", f"/v1/twins/{name}/events", params=parameters, timeout=None) as response:
-            if not response.is_success:
-                await response.aread()
-                _read(response, schemas.Message)
-            async for line in response.aiter_lines():
-                if (message := _event(line)) is not None:
-                    yield message
+        route = f"/v1/twins/{name}/events"
+        with _lost_is_unreachable(str(self._http.base_url)):
+            async with self._http.stream("GET", route, params=parameters, timeout=STREAM_TIMEOUT) as response:
+                if not response.is_success:
+                    await response.aread()
+                    _read(response, schemas.Message)
+                async for line in response.aiter_lines():
+                    if (message := _event(line)) is not None:
+                        yield message

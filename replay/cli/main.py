@@ -14,6 +14,7 @@ from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
 from replay.cli.forecast import forecast
 from replay.cli.play import replay
+from replay.cli.record import record
 from replay.cli.serve import serve
 from replay.cli.simulate import simulate
 from replay.errors import ReplayError
@@ -36,7 +37,7 @@ def twin(traceback: bool) -> None:
     """
 
 
-for command in (demo, serve, simulate, replay, calibrate, forecast, close_loop):
+for command in (demo, serve, simulate, replay, record, calibrate, forecast, close_loop):
     twin.add_command(command)
 
 

@@ -1,0 +1,107 @@
+"""Writing MCAP files sample by sample: one topic per telemetry channel, JSON with a JSON Schema, log time = sample time."""
+
+import contextlib
+import math
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import orjson
+from mcap.writer import Writer
+
+from replay.errors import RecordingError
+
+METADATA_NAME = "thermal-twin"
+SCHEMA_NAME = "thermal_twin.Sample"
+VALUE = "value"
+
+
+class McapWriter:
+    """An MCAP file in the making. Use it as a context manager: the file appears whole when it ends, or not at all.
+
+    ``keep`` lets it appear even if an error ends it: a recording of what happened is worth having up to there.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        topics: Iterable[str],
+        units: Mapping[str, str] | None = None,
+        metadata: Mapping[str, str] | None = None,
+        *,
+        keep: bool = False,
+    ) -> None:
+        """Prepare to write ``topics``; RecordingError on entry if the file cannot be written."""
+        self._target, self._keep = Path(path), keep
+        self._partial = self._target.with_name(f".{self._target.name}.{os.getpid()}.partial")
+        self._topics, self._units, self._metadata = list(topics), dict(units or {}), dict(metadata or {})
+        self._channels: dict[str, int] = {}
+        self.count = 0
+
+    def __enter__(self) -> Self:
+        """Open the file beside its later place."""
+        try:
+            self._stream = self._partial.open("wb")
+        except OSError as error:
+            raise self._refusal(error) from error
+        self._writer = Writer(self._stream)
+        self._writer.start(profile="", library="thermal-twin")
+        if self._metadata:
+            self._writer.add_metadata(METADATA_NAME, self._metadata)
+        self._channels = {topic: self._add_channel(topic) for topic in self._topics}
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Put the file in its place, or leave nothing behind."""
+        try:
+            with self._stream:
+                self._writer.finish()
+            if kind is None or (self._keep and self.count):
+                os.replace(self._partial, self._target)
+        except OSError as error:
+            raise self._refusal(error) from error
+        finally:
+            with contextlib.suppress(OSError):
+                self._partial.unlink(missing_ok=True)
+
+    def add(self, topic: str, instant_ns: int, value: float) -> None:
+        """Write one sample; NaN, the missing sample, writes nothing.
+
+        Raises
+        ------
+        RecordingError
+            If the instant is before 1970, the value infinite, or the disk full.
+        """
+        if math.isnan(value):
+            return
+        if math.isinf(value) or instant_ns < 0:
+            wrong = "is infinite" if math.isinf(value) else "has a time before 1970, which MCAP cannot express"
+            raise RecordingError(f"{self._target}: a sample of channel '{topic}' {wrong}")
+        data = b'{"value":%b}' % orjson.dumps(value)
+        try:
+            self._writer.add_message(
+                self._channels[topic], instant_ns, data, publish_time=instant_ns, sequence=self.count
+            )
+        except OSError as error:
+            raise self._refusal(error) from error
+        self.count += 1
+
+    def _add_channel(self, topic: str) -> int:
+        """Register one topic and its schema; return the channel's number."""
+        unit = self._units.get(topic)
+        schema = {
+            "$schema": "https://json-schema.org/draft/2020-12/schema",
+            "title": SCHEMA_NAME,
+            "type": "object",
+            "properties": {VALUE: {"type": "number", "description": f"{topic} in {unit}" if unit else topic}},
+            "required": [VALUE],
+        }
+        schema_id = self._writer.register_schema(SCHEMA_NAME, "jsonschema", orjson.dumps(schema))
+        return int(self._writer.register_channel(topic, "json", schema_id, {"unit": unit} if unit else {}))
+
+    def _refusal(self, error: OSError) -> RecordingError:
+        return RecordingError(f"{self._target}: cannot be written ({error.strerror or error})")
