@@ -24,10 +24,14 @@ class Batch:
         Microseconds since 1970.
     values : (n_channels, n_times)
         In the channels' own units, rows in the order of the twin's channels; NaN is a missing sample.
+    framed
+        Whether each sample came as a frame of its own: a frame without any value says nothing and is not taken in,
+        whereas a column may have a missing value wherever others have one.
     """
 
     time_us: Instants
     values: NDArray[np.float64]
+    framed: bool = False
 
 
 def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
@@ -83,7 +87,7 @@ def parse_frames(body: bytes, channels: Sequence[str]) -> Batch:
     for row, name in enumerate(channels):
         column = [sample.get(name) for _, sample in frames]
         values[row] = _numbers(column, partial(_line_field, name))
-    return Batch(_frame_times([time for time, _ in frames]), values)
+    return Batch(_frame_times([time for time, _ in frames]), values, framed=True)
 
 
 def _frame_times(times: list[Any]) -> Instants:

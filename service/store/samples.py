@@ -59,9 +59,10 @@ class Samples:
 def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
-    empty: NDArray[np.bool_] = np.logical_and.reduce(np.isnan(batch.values), axis=0)
-    if empty.any():
-        return _without(connection, twin, batch, empty)
+    if batch.framed:
+        empty: NDArray[np.bool_] = np.logical_and.reduce(np.isnan(batch.values), axis=0)
+        if empty.any():
+            return _without(connection, twin, batch, empty)
     if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
         head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
         if head is not None:
