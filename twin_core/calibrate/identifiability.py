@@ -24,7 +24,7 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     -------
     list of str
         Positive parameters uncertain by more than a factor e, signed ones by more than their own size, others by one in
-        the solver's coordinate: a whole share, or the whole record.
+        the solver's coordinate: a whole share, or an onset by as much as lies between two looks for it.
     """
     names = []
     for position, index in enumerate(parameters.free_index):

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.calibrate.bounded import bounded_step
 from twin_core.calibrate.latent_heat import (
     HeatFit,
     LatentHeat,
@@ -78,9 +79,14 @@ def gauss_newton_step(
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]
         gradient -= flat[:, :-1].T @ flat[:, -1]
+    return bounded_step(_solved, hessian, gradient, *problem.step_bounds(free)), hessian
+
+
+def _solved(hessian: FloatArray, gradient: FloatArray) -> FloatArray:
+    """Return the Newton step, scaled so that every parameter counts alike, and hardly damped."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     damped = hessian * scale[:, None] * scale + 1e-6 * np.eye(scale.size)
-    return -scale * np.linalg.solve(damped, scale * gradient), hessian
+    return -scale * np.linalg.solve(damped, scale * gradient)
 
 
 def leashed(problem: Problem, leash: float) -> FloatArray:

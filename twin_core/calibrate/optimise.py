@@ -1,12 +1,14 @@
 """Levenberg-Marquardt on the normal equations: a second-order solver whose outcome is a value, never silence."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.calibrate.bounded import bounded_step
 from twin_core.calibrate.problem import Fit, Problem
 
 Status = Literal["converged", "stalled", "iteration_limit", "early_stopping", "no_solution"]
@@ -100,7 +102,8 @@ def minimise(
     hessian, gradient = problem.normal_equations(x, fit)
     iterations = 0
     while iterations < max_iterations:
-        step = _limited(_step(hessian, gradient, damping), problem.logarithmic)
+        newton = bounded_step(partial(_step, damping=damping), hessian, gradient, *problem.step_bounds(x))
+        step = _limited(newton, problem.logarithmic)
         predicted = -(gradient @ step + 0.5 * step @ hessian @ step)
         trial = problem.solve(x + step, fit)
         gain = (fit.cost - trial.cost) / max(float(predicted), 1e-300) if np.isfinite(trial.cost) else -1.0

@@ -147,6 +147,15 @@ class Problem:
         free = [self.network.parameters.parameters[i] for i in self.network.parameters.free_index]
         return np.array([k for k, p in enumerate(free) if is_logarithmic(p.transform)], dtype=np.int64)
 
+    def step_bounds(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far down and up one step may go from a vector of unknowns or free parameters, of its size each."""
+        parameters = self.network.parameters
+        leap = np.full(unknowns.size, np.inf)
+        leap[: self.n_free] = parameters.leap
+        lowest = -leap
+        lowest[: self.n_free] = np.maximum(lowest[: self.n_free], parameters.lowest - unknowns[: self.n_free])
+        return np.minimum(lowest, 0.0), leap
+
     def start(self) -> FloatArray:
         """Return the unknown vector at the network's present values and the prior initial states."""
         return np.concatenate([self.network.parameters.free, *(s.start_prior_K for s in self.segments)])

@@ -38,6 +38,8 @@ class Quality:
         Weak prior around the starting value, in ln for positive ones, in scales for instants; None = flat.
     lower
         The least value, itself possible; None where there is none or the value is positive anyway.
+    resolution
+        Standard deviation of what no telemetry can tell, beyond what the fit tells.
     instant
         For an instant on the clock of ``Record.clock_s``: where the solver counts from, and in what; None for others.
     """
@@ -49,6 +51,7 @@ class Quality:
     prior_std: float | None = None
     lower: float | None = None
     instant: Shifted | None = None
+    resolution: float = 0.0
 
     @property
     def transform(self) -> Transform:
@@ -58,14 +61,16 @@ class Quality:
         return self.instant or (Identity() if self.lower is None else Floored(self.lower))
 
     def moved(self, amount: float) -> float | None:
-        """Return the value at a distance from null, on the bound where it lies a little beyond; None far beyond it."""
+        """Return the value at a distance from null, None if it is not positive but must be.
+
+        Beyond a lower bound it is put on it: the distance is reckoned from a declared size that the missing effect has
+        spoilt, so that what vanishes altogether may look like less than nothing.
+        """
         assert self.null is not None
         value = self.null + amount
-        if self.positive:
-            return value if value > 1e-12 else None
-        if self.lower is None or value >= self.lower:
-            return value
-        return self.lower if value - self.lower > self.lower - self.null else None
+        if self.positive and not value > 1e-12:
+            return None
+        return value if self.lower is None else max(value, self.lower)
 
 
 @dataclass(frozen=True)

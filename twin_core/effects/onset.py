@@ -26,9 +26,9 @@ class OnsetEffect(Effect):
     amplitude: ClassVar[Quality]
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return the amplitude and the onset, whose prior is as wide as the record."""
-        clock = Shifted(self.settings["begin_s"], self.settings["span_s"])
-        return self.amplitude, Quality("time", "s", prior_std=1.0, instant=clock)
+        """Return the amplitude and the onset, which moves by the spacing of ``starts``; its prior spans the record."""
+        clock = Shifted(self.settings["begin_s"], self.settings["span_s"] / N_ONSETS)
+        return self.amplitude, Quality("time", "s", prior_std=float(N_ONSETS), instant=clock)
 
     def ramp(self, clock_s: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return the share that has set in, from 0 to 1, and its derivative by the onset."""

@@ -1,7 +1,9 @@
 """A sensor that reads too much or too little from an instant on: a cracked bond, a new range, a changed reference."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Quality, Where
@@ -35,6 +37,11 @@ class SensorBias(OnsetEffect):
     reference = "Gertler, Fault Detection and Diagnosis in Engineering Systems, ch. 3 (additive sensor faults)"
     words = "reads too much or too little from an instant on"
     amplitude = Quality("b_K", "K", null=0.0)
+
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return the bias and its onset, which lies anywhere between the last good sample and the first bad one."""
+        bias, onset = super().qualities()
+        return bias, replace(onset, resolution=self.settings["width_s"] / np.sqrt(12.0))
 
     def addition(self, layout: Layout) -> Addition:
         """Return the offset of the sensor."""

@@ -1,7 +1,7 @@
 """Bijections between a physical value and the unbounded number that a solver moves."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from scipy.special import expit
@@ -9,6 +9,16 @@ from scipy.special import expit
 
 class Transform(Protocol):
     """A smooth, increasing map from the real line onto the admissible values."""
+
+    @property
+    def lowest(self) -> float:
+        """The free number below which there are no further values; minus infinity for most."""
+        ...
+
+    @property
+    def leap(self) -> float:
+        """The longest step of the free number in which a linearisation still tells something; infinite for most."""
+        ...
 
     def to_value(self, free: float) -> float:
         """Return the physical value."""
@@ -27,6 +37,9 @@ class Transform(Protocol):
 class Identity:
     """value = free: a quantity of either sign."""
 
+    lowest: ClassVar[float] = -np.inf
+    leap: ClassVar[float] = np.inf
+
     def to_value(self, free: float) -> float:
         """Return the value itself."""
         return free
@@ -42,10 +55,16 @@ class Identity:
 
 @dataclass(frozen=True)
 class Shifted:
-    """value = reference + scale * free: an instant, whose own number is too large for relative tolerances."""
+    """value = reference + scale * free: an instant, whose own number is too large for relative tolerances.
+
+    It moves by one scale at once: how a response changes with an instant is told near that instant only.
+    """
 
     reference: float
     scale: float
+
+    lowest: ClassVar[float] = -np.inf
+    leap: ClassVar[float] = 1.0
 
     def to_value(self, free: float) -> float:
         """Return reference + scale * free."""
@@ -64,11 +83,17 @@ class Shifted:
 class Floored:
     """value = max(free, lower): a quantity that may reach its bound, as a share that falls to nothing does.
 
-    The slope stays one below the bound: a solver that sits there may come back, and a standard deviation is that of the
-    quantity without its bound.
+    The slope is one on the bound too, so that a standard deviation there is that of the quantity without its bound.
     """
 
     lower: float
+
+    leap: ClassVar[float] = np.inf
+
+    @property
+    def lowest(self) -> float:
+        """The bound."""
+        return self.lower
 
     def to_value(self, free: float) -> float:
         """Return the number, or the bound where it lies below."""
@@ -86,6 +111,9 @@ class Floored:
 @dataclass(frozen=True)
 class Log:
     """value = exp(free): a positive quantity of unknown order of magnitude."""
+
+    lowest: ClassVar[float] = -np.inf
+    leap: ClassVar[float] = np.inf
 
     def to_value(self, free: float) -> float:
         """Return exp(free), held within e^-300 and e^300 so that a wild trial step stays a number."""
@@ -106,6 +134,9 @@ class LogInterval:
 
     lower: float
     upper: float
+
+    lowest: ClassVar[float] = -np.inf
+    leap: ClassVar[float] = np.inf
 
     def _span(self) -> float:
         return float(np.log(self.upper / self.lower))

@@ -58,6 +58,16 @@ class ParameterSet:
         stds = [self.parameters[i].prior_std for i in self.free_index]
         return np.array([np.inf if s is None else s for s in stds], dtype=np.float64)
 
+    @property
+    def lowest(self) -> FloatArray:
+        """Lower bounds of the free vector, (n_free,); minus infinity where there is none."""
+        return np.array([self.parameters[i].transform.lowest for i in self.free_index], dtype=np.float64)
+
+    @property
+    def leap(self) -> FloatArray:
+        """Longest steps of the free vector at once, (n_free,); infinite where any will do."""
+        return np.array([self.parameters[i].transform.leap for i in self.free_index], dtype=np.float64)
+
     def to_values(self, free: FloatArray) -> FloatArray:
         """Return all physical values, (n_parameters,), for a free vector (n_free,)."""
         values = self.values
