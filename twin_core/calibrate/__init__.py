@@ -12,6 +12,7 @@ from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
 METHODS = ("second-order", "neural-ode")
+LOSSES = ("squared", "huber")
 
 
 def calibrate(
@@ -19,6 +20,7 @@ def calibrate(
     records: Sequence[Record],
     *,
     method: str = "second-order",
+    loss: str = "squared",
     progress: Progress = no_progress,
 ) -> CalibratedModel:
     """Calibrate a declared network against telemetry.
@@ -32,6 +34,8 @@ def calibrate(
     method
         ``second-order``: Levenberg-Marquardt with exact sensitivities. ``neural-ode``: the method of paper A
         (arXiv 2605.28452), Adam on windows of the record; it states no uncertainty of the parameters.
+    loss
+        ``squared``, or ``huber`` for readings with outliers; the second method knows ``squared`` only.
     progress
         Called with the fraction done and a message.
 
@@ -47,17 +51,22 @@ def calibrate(
     """
     if method not in METHODS:
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
-    from twin_core.calibrate.second_order import fit_network, to_model
+    if loss not in LOSSES:
+        raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
+    from twin_core.calibrate.second_order import fit_trajectories, to_model
 
     if method == "neural-ode":
+        if loss != "squared":
+            raise ModelError(f"method '{method}' knows the squared loss only; use second-order with '{loss}'")
         from twin_core.calibrate.neural_ode import fit_neural_ode
 
         _, calibration = fit_neural_ode(spec, records, progress=progress)
+        model = to_model(calibration, (), uncertain=False)
     else:
-        _, calibration = fit_network(spec, records, progress=progress)
-    model = to_model(calibration, (), uncertain=method != "neural-ode")
+        calibration = fit_trajectories(spec, records, loss="huber" if loss == "huber" else "squared", progress=progress)
+        model = to_model(calibration, ())
     progress(1.0, "calibrated")
     return model
 
 
-__all__ = ["METHODS", "CalibratedModel", "calibrate"]
+__all__ = ["LOSSES", "METHODS", "CalibratedModel", "calibrate"]

@@ -119,12 +119,14 @@ class Problem:
     """Trajectory matching (paper A, eq. 2) over all segments, with initial states among the unknowns.
 
     The unknown vector x is the network's free parameters followed by the initial temperatures of each segment:
-    (n_free + n_segments * n_nodes,).
+    (n_free + n_segments * n_nodes,). Residuals beyond ``huber`` times their noise count linearly instead of squared
+    (Huber 1964), so that a bad reading pulls no harder than a mediocre one.
     """
 
     network: Network
     segments: tuple[Segment, ...]
     noise_K: FloatArray
+    huber: float = np.inf
 
     @property
     def n_free(self) -> int:
@@ -186,11 +188,17 @@ class Problem:
             path = rollout(self.network, values, unknowns[self.start_columns(i)], segment.forcing, near=guess)
             trajectories.append(path)
             predicted.append(self._readings(values, segment, path))
-            cost += 0.5 * float(np.nansum(((predicted[-1] - segment.measured_K) / self.noise_K) ** 2))
+            cost += self._loss((predicted[-1] - segment.measured_K) / self.noise_K)
             if not path.converged:
                 cost = np.inf
                 break
         return Fit(cost, tuple(trajectories), tuple(predicted))
+
+    def _loss(self, scaled: FloatArray) -> float:
+        """Return the loss of residuals in units of their noise; NaN where there is no reading."""
+        size = np.abs(scaled)
+        inner = np.minimum(size, self.huber)
+        return float(np.nansum(inner * (size - 0.5 * inner)))
 
     def _readings(self, values: FloatArray, segment: Segment, path: Rollout) -> FloatArray:
         """Return what the sensors read along a trajectory, (n_samples, n_sensors)."""
@@ -244,6 +252,10 @@ class Problem:
         ):
             valid = np.isfinite(residual)
             weight = np.broadcast_to(1.0 / self.noise_K, residual.shape)[valid]
+            if np.isfinite(self.huber):  # iteratively reweighted least squares
+                weight = weight * np.sqrt(
+                    np.minimum(1.0, self.huber / np.maximum(np.abs(residual[valid] * weight), 1e-12))
+                )
             rows = block[valid] * weight[:, None]
             columns = np.r_[0 : self.n_free, self.start_columns(i)]
             hessian[np.ix_(columns, columns)] += rows.T @ rows
@@ -258,7 +270,7 @@ class Problem:
         for segment in self.segments:
             mean, std = _start_prior(network, segment.measured_K)
             segments.append(replace(segment, start_prior_K=mean, start_std_K=std))
-        return Problem(network, tuple(segments), self.noise_K)
+        return replace(self, network=network, segments=tuple(segments))
 
 
 def build_problem(

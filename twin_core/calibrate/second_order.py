@@ -1,23 +1,26 @@
 """The default calibration: trajectory matching by a second-order solver with exact sensitivities."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
+from twin_core.calibrate.approach import COARSE_TOLERANCE, TOLERANCE, approach, coarse_problem
 from twin_core.calibrate.identifiability import words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
+from twin_core.calibrate.outliers import without_outliers
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, stacked_jacobian
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.effects.base import Effect
-from twin_core.errors import ModelError
+from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.rollout import rollout
@@ -27,6 +30,14 @@ STEP_ERROR_SHARE = 0.1
 """Time steps are halved until halving changes no reading by more than this share of the noise."""
 
 NO_COVARIANCE = "this method states no uncertainty of the parameters; forecasts carry only that of state and misfit"
+
+STEP_ERROR_FLOOR_K = 1e-3
+"""No step is halved for less: no sensor resolves it."""
+
+HUBER = 1.345
+"""Residuals, in units of their noise, beyond which Huber's loss is linear: 95 % efficient where there is no outlier."""
+
+Loss = Literal["squared", "huber"]
 
 MAX_HALVINGS = 3
 N_STARTS = 4
@@ -57,7 +68,9 @@ def sampling_step_s(records: Sequence[Record]) -> float:
     return float(np.median(np.concatenate([np.diff(r.time_s) for r in records if r.time_s.size > 1] or [np.ones(1)])))
 
 
-def prepare(spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect] = ()) -> tuple[Problem, float]:
+def prepare(
+    spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect] = (), *, loss: Loss = "squared"
+) -> tuple[Problem, float]:
     """Return the fitting problem of a declared network, and its longest time step.
 
     Levels of tables are read from the telemetry, parameters that nobody guessed start from integrated heat balances, and
@@ -71,23 +84,32 @@ def prepare(spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect]
         Segments of telemetry in SI, each with its own initial state.
     effects
         Terms beyond the declaration, at their starting values.
+    loss
+        ``squared``, or ``huber``: residuals beyond 1.345 times their noise count linearly.
 
     Raises
     ------
     TelemetryError
         If telemetry lacks a channel that the model needs, or has too few samples.
     """
+    records = without_outliers(spec, records)
     noise = sensor_noise_K(spec, list(records))
     network = build_network(spec, effects, table_knots=table_levels(spec, records))
     step = 1.5 * sampling_step_s(records)
     problem = build_problem(network, records, noise, step)
+    readings = sum(int(segment.valid.sum()) for segment in problem.segments)
+    if readings < problem.n_unknowns:
+        raise TelemetryError(
+            f"{records[0].name}: {readings} readings cannot tell {problem.n_unknowns} unknowns (parameters and initial"
+            " temperatures); give more telemetry, or values that are known"
+        )
     problem = problem.with_network(network.with_parameters(balance_start(problem)))
     for _ in range(MAX_HALVINGS):
         finer = build_problem(problem.network, records, noise, step / 2.0)
         if _step_error(problem, finer) < STEP_ERROR_SHARE:
             break
         step, problem = step / 2.0, finer
-    return problem, step
+    return replace(problem, huber=HUBER if loss == "huber" else np.inf), step
 
 
 def fit_network(
@@ -129,6 +151,60 @@ def fit_network(
     return fit, Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
 
 
+def fit_trajectories(
+    spec: TwinSpec, records: Sequence[Record], *, loss: Loss = "squared", progress: Progress = no_progress
+) -> Calibration:
+    """Calibrate a declared network by trajectories alone (paper A, eq. 2).
+
+    Starts from the guesses, and where some are missing from several places about what the heat balance tells; on a
+    thinned record first, where it is long.
+
+    Parameters
+    ----------
+    spec, records, loss
+        As in :func:`prepare`.
+    progress
+        Called with the fraction done.
+
+    Raises
+    ------
+    TelemetryError
+        If the telemetry cannot be used.
+    ModelError
+        If the heat balance has no solution at any start.
+    """
+    progress(0.0, "reading noise and levels")
+    problem, step_s = prepare(spec, records, loss=loss)
+    coarse = coarse_problem(problem, step_s)
+    starts = [problem.start(), *_scattered(problem, problem.start())]
+    found = []
+    for trial, start in enumerate(starts):
+        progress(0.1 + 0.5 * trial / len(starts), "fitting trajectories")
+        found.append(approach(coarse, start, tolerance=TOLERANCE if coarse is problem else COARSE_TOLERANCE))
+    progress(0.6, "fitting all samples")
+    best = min(found, key=lambda o: coarse.solve(o.unknowns, o.fit).cost)
+    if coarse is not problem and best.status != "no_solution":
+        fine = approach(problem, best.unknowns)
+        best = replace(fine, iterations=best.iterations + fine.iterations)
+    if best.status == "no_solution":
+        raise ModelError(f"calibration failed: {ADVICE[best.status]}")
+    progress(0.9, "weighing what is left")
+    return Calibration(problem, best, fit_whitener(problem, problem.residuals(best.fit)), step_s)
+
+
+def _scattered(problem: Problem, unknowns: FloatArray) -> list[FloatArray]:
+    """Return further starts, in which the parameters that nobody guessed are scattered by a factor e."""
+    parameters = problem.network.parameters
+    guessed = np.flatnonzero([parameters.parameters[i].guessed for i in parameters.free_index])
+    generator = np.random.default_rng(0)
+    starts = []
+    for _ in range(1, N_STARTS if guessed.size else 1):
+        scattered = unknowns.copy()
+        scattered[guessed] += generator.normal(0.0, 1.0, guessed.size)
+        starts.append(scattered)
+    return starts
+
+
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
     """Return the open-loop calibration that starts from a fit in the presence of latent heat.
 
@@ -148,21 +224,17 @@ def _step_error(problem: Problem, finer: Problem) -> float:
             continue
         read = [p.at_samples(s.forcing.sample_step) for p, s in zip(paths, (coarse, fine), strict=True)]
         change = np.abs(read[0] - read[1])[:, problem.network.sensor_node]
-        worst = max(worst, float((change / problem.noise_K).max()))
+        worst = max(worst, float((change / np.maximum(problem.noise_K, STEP_ERROR_FLOOR_K / STEP_ERROR_SHARE)).max()))
     return worst
 
 
 def _best_start(fit: HeatFit, progress: Progress) -> Optimum:
     """Return the best optimum from the heat fit, from the declared guesses, and where those are missing from others."""
     problem = fit.problem
-    best = min(minimise(problem, fit.unknowns()), minimise(problem), key=lambda o: o.fit.cost)
-    parameters, unknowns = problem.network.parameters, fit.unknowns()
-    guessed = np.array([parameters.parameters[i].guessed for i in parameters.free_index], dtype=np.bool_)
-    generator = np.random.default_rng(0)
-    for trial in range(1, N_STARTS if guessed.any() else 1):
+    near = minimise(problem, approach(problem).unknowns)
+    best = min(minimise(problem, fit.unknowns()), near, key=lambda o: o.fit.cost)
+    for trial, scattered in enumerate(_scattered(problem, fit.unknowns()), start=1):
         progress(0.4 + 0.15 * trial, "fitting from other starting points")
-        scattered = unknowns.copy()
-        scattered[: problem.n_free][guessed] += generator.normal(0.0, 1.0, int(guessed.sum()))
         best = min(best, minimise(problem, scattered, max_iterations=40), key=lambda o: o.fit.cost)
     return best
 

@@ -76,12 +76,21 @@ def evaluate_balance(
     n_points, n_nodes = along.temperatures_K.shape
     heat = np.zeros((n_points, n_nodes)) if extra_W is None else extra_W.astype(np.float64)
     jacobian = np.zeros((n_points, n_nodes, n_nodes))
+    everywhere = tuple(range(n_nodes))
     entries: list[Entry] = []
     for term, index in zip(network.terms, network.term_indices, strict=True):
         part = term.evaluate(along, values[index])
-        nodes = np.asarray(part.nodes)
-        heat[:, nodes] += part.heat_W
-        jacobian[:, nodes[:, None], nodes[None, :]] += part.d_temperature
+        if len(part.nodes) == 1:  # slices, which cost a fraction of index arrays
+            node = part.nodes[0]
+            heat[:, node] += part.heat_W[:, 0]
+            jacobian[:, node, node] += part.d_temperature[:, 0, 0]
+        elif part.nodes == everywhere:
+            heat += part.heat_W
+            jacobian += part.d_temperature
+        else:
+            nodes = np.asarray(part.nodes)
+            heat[:, nodes] += part.heat_W
+            jacobian[:, nodes[:, None], nodes[None, :]] += part.d_temperature
         if derivatives:
             entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
             entries += [

@@ -1,0 +1,103 @@
+"""From rough guesses to the neighbourhood of the optimum: the misfit counts as noise, and falls as the model improves.
+
+Far from the optimum, and wherever a network is coarser than what it describes, residuals dwarf the noise of the sensors.
+Weighed by that noise the priors say nothing, and the search runs into corners where parameters vanish and no longer move
+the trajectories. Weighed by the misfit it stays where the model is sensible. Long records are first thinned.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from twin_core._typing import BoolArray, FloatArray
+from twin_core.calibrate.optimise import Optimum, minimise
+from twin_core.calibrate.problem import Fit, Problem, build_problem
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+CAUTION = 3.0
+"""The misfit is weighed as this many times itself: its samples are not independent of each other."""
+
+MAX_ROUNDS, SETTLED = 6, 0.9
+"""Rounds at most; a round that leaves more than this share of the misfit is the last."""
+
+MAX_ITERATIONS, TOLERANCE, COARSE_TOLERANCE = 20, 1e-4, 1e-3
+"""Of the search within a round; a thinned record is but a start."""
+
+COARSE_SAMPLES = 1200
+"""Records longer than twice this are thinned to about this many samples for a first approach."""
+
+
+def misfit_K(problem: Problem, fit: Fit) -> float:
+    """Return the root mean square residual beyond the sensors' noise, all sensors together."""
+    residual = np.concatenate(problem.residuals(fit))
+    if np.isfinite(problem.huber):  # outliers are no misfit: the median tells what the others do
+        excess_K2 = float(np.nanmedian((residual / 0.6745) ** 2 - problem.noise_K**2))
+    else:
+        excess_K2 = float(np.nanmean(residual**2 - problem.noise_K**2))
+    return float(np.sqrt(max(excess_K2, 0.0)))
+
+
+def approach(problem: Problem, unknowns: FloatArray | None = None, *, tolerance: float = TOLERANCE) -> Optimum:
+    """Return an optimum in which noise and misfit are weighed together.
+
+    Parameters
+    ----------
+    problem
+        What is fitted to what.
+    unknowns : (n_unknowns,)
+        Where to start; the problem's own start by default.
+    tolerance
+        A round ends when a step lowers the cost by less than this share.
+
+    Returns
+    -------
+    Optimum
+        Its fit's cost is that of the last round's weights; where the model explains the readings down to their noise,
+        the search has ended with the noise alone.
+    """
+    x = problem.start() if unknowns is None else unknowns
+    fit = problem.solve(x)
+    best = Optimum(x, fit, np.eye(x.size), "no_solution", 0)
+    if not np.isfinite(fit.cost):
+        return best
+    iterations, before = 0, misfit_K(problem, fit)
+    for _ in range(MAX_ROUNDS):
+        noise = np.hypot(problem.noise_K, CAUTION * before)
+        weighed = replace(problem, noise_K=noise)
+        best = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance)
+        x, fit, iterations = best.unknowns, best.fit, iterations + best.iterations
+        after = misfit_K(problem, fit)
+        if after > SETTLED * before:
+            break
+        before = after
+    if (CAUTION * misfit_K(problem, fit) < problem.noise_K).all():
+        best = minimise(problem, x, near=fit)
+    return replace(best, iterations=iterations + best.iterations)
+
+
+def coarse_problem(problem: Problem, step_s: float) -> Problem:
+    """Return a problem on thinned records, whose time steps are longer by as much; itself where records are short."""
+    records = [segment.record for segment in problem.segments]
+    stride = sum(r.time_s.size for r in records) // COARSE_SAMPLES
+    if stride < 2 or min(r.time_s.size for r in records) < 10 * stride:
+        return problem
+    thin = [thinned(problem.network.spec, record, stride) for record in records]
+    coarse = build_problem(problem.network, thin, problem.noise_K, stride * step_s)
+    return replace(coarse, huber=problem.huber)
+
+
+def thinned(spec: TwinSpec, record: Record, stride: int) -> Record:
+    """Return every ``stride``-th sample; heat that holds between samples is averaged, so that none is lost."""
+    first = np.arange(0, record.time_s.size, stride)
+    held = {name for name, channel in spec.channels.items() if channel.kind == "power" and channel.is_held}
+    values = {name: _means(c, first) if name in held else c[first] for name, c in record.values.items()}
+    return replace(record, time_s=record.time_s[first], values=values)
+
+
+def _means(column: FloatArray, first: np.ndarray) -> FloatArray:
+    """Return the mean of the finite samples from each of ``first`` up to the next, NaN where there is none."""
+    valid: BoolArray = np.isfinite(column)
+    counts = np.add.reduceat(valid.astype(np.float64), first)
+    sums = np.add.reduceat(np.where(valid, column, 0.0), first)
+    return np.where(counts > 0, sums / np.maximum(counts, 1.0), np.nan)
