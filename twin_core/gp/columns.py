@@ -16,7 +16,7 @@ from numba import njit
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
-from twin_core.gp.kalman import LOG_2PI, project, update
+from twin_core.gp.kalman import LOG_2PI, failure, project, update
 from twin_core.gp.linalg import alike, congruence
 from twin_core.gp.state_space import LinearModel, ModelArrays
 
@@ -128,5 +128,5 @@ def whiten_responses(
     out = np.zeros((int(np.isfinite(y).sum()), columns.shape[0] + 1))
     total, failed = _run(model.arrays, y, columns, float(settle_tolerance), out)
     if failed >= 0:
-        raise ModelError(f"sample {failed}: a sensor without noise measures what is known exactly; give it some noise")
+        raise failure(model, failed)
     return WhiteRegression(out[:, 0].copy(), -out[:, 1:], total)

@@ -14,7 +14,7 @@ exponential* (1978).
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numba import njit
@@ -127,10 +127,17 @@ def discretise(feedback: Values, diffusion: Values, step_s: FloatArray, *, schem
     steps = np.atleast_1d(np.asarray(step_s, dtype=np.float64))
     if not (np.isfinite(steps).all() and (steps > 0).all()):
         raise ModelError("steps must be positive and finite: times must increase strictly")
+    if scheme not in get_args(Scheme):
+        raise ModelError(f"scheme: must be one of {', '.join(get_args(Scheme))}, it is {scheme!r}")
+    shapes = (np.shape(feedback)[-2:], np.shape(diffusion)[-2:])
+    if len(shapes[0]) != 2 or shapes[0][0] != shapes[0][1] or shapes[0] != shapes[1]:
+        raise ModelError(f"feedback and diffusion must be square and of one size; they are {shapes[0]} and {shapes[1]}")
     kind = np.result_type(feedback, diffusion, np.float64)
     f, d = (np.ascontiguousarray(m[None] if m.ndim == 2 else m, dtype=kind) for m in (feedback, diffusion))
     if not (np.isfinite(f).all() and np.isfinite(d).all()):
-        raise ModelError("the dynamics hold a number that is not finite; a node needs a positive capacity")
+        raise ModelError(
+            "the dynamics or their noise hold a number that is not finite: a parameter is too large or small"
+        )
     out = Discrete(*(np.zeros((steps.size, *f.shape[1:]), dtype=kind) for _ in range(4)))
     _discretise(f, d, steps, out.transition, out.process_cov, out.hold, out.ramp)
     return out if scheme == "exact" else _first_order(f, d, steps, out.transition)

@@ -9,7 +9,7 @@ Smoothing* (2023), theorem 6.6; Durbin and Koopman, *Time Series Analysis by Sta
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numba import njit
@@ -60,6 +60,16 @@ class Filtered:
     predicted_mean: FloatArray
     predicted_cov: FloatArray
     settled: BoolArray
+
+
+def failure(model: LinearModel, sample: int) -> ModelError:
+    """Return the error of a sample whose variance is not positive."""
+    if (model.noise_variance == 0.0).any():
+        return ModelError(f"sample {sample}: a sensor without noise measures what is known exactly; give it some noise")
+    return ModelError(
+        f"sample {sample}: variances differ by more than double precision holds; give the first state a prior that is "
+        "less vague, or the sensors more noise"
+    )
 
 
 @njit(cache=True)
@@ -255,7 +265,9 @@ def kalman_filter(
         A shape is wrong, or a sample without noise contradicts what the model already knows exactly.
     """
     y = model.observed(observations)
-    level = ("likelihood", "innovations", "states", "all").index(keep)
+    if keep not in get_args(Keep):
+        raise ModelError(f"keep: must be one of {', '.join(get_args(Keep))}, it is {keep!r}")
+    level = get_args(Keep).index(keep)
     n_times, n, m = model.n_times, model.n_states, model.n_sensors
     told, stated, ahead = (n_times if level >= wanted else 0 for wanted in (1, 2, 3))
     store = _Store(
@@ -271,5 +283,5 @@ def kalman_filter(
     )
     total, failed = _run(model.arrays, y, float(settle_tolerance), store)
     if failed >= 0:
-        raise ModelError(f"sample {failed}: a sensor without noise measures what is known exactly; give it some noise")
+        raise failure(model, failed)
     return Filtered(total, **store._asdict())

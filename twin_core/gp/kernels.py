@@ -87,6 +87,8 @@ class Matern(Kernel):
         """Refuse an order without a finite state."""
         if self.half_order not in (1, 3, 5):
             raise ModelError(f"Matern: half_order must be 1, 3 or 5, not {self.half_order}")
+        if self.decay is not None and not 0.0 < self.decay < np.inf:
+            raise ModelError(f"Matern: decay must be positive, it is {self.decay}")
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -99,10 +99,10 @@ def solve_cholesky(lower: FloatArray, columns: FloatArray) -> None:
 def alike(a: FloatArray, b: FloatArray, tolerance: float) -> bool:
     """Return whether two covariances agree, each element measured against the variances of its row and column.
 
-    A negative tolerance is never met.
+    A tolerance that is negative, or no number, is never met.
     """
     n = a.shape[0]
-    if tolerance < 0.0:
+    if not tolerance >= 0.0:
         return False
     for i in range(n):
         for j in range(i + 1):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, Json
+from twin_core.errors import ModelError
 from twin_core.gp.basis import Basis
 
 
@@ -71,8 +72,15 @@ class ForcePolynomial:
         temperature_K : (...)
         boundary_K : (...), optional
             Needed where the heat depends on it.
+
+        Raises
+        ------
+        ModelError
+            A temperature is not finite, or the boundary's is missing.
         """
         raw = self.basis.scaled(temperature_K, boundary_K)
+        if not np.isfinite(raw).all():
+            raise ModelError("the heat is asked for at a temperature that is not finite")
         held = self.basis.held(raw)
         away = np.abs(raw - held)
         outside = np.asarray((away > 1e-9).any(axis=0))

@@ -16,7 +16,7 @@ from numba import njit
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
-from twin_core.gp.kalman import LOG_2PI, project, update
+from twin_core.gp.kalman import LOG_2PI, failure, project, update
 from twin_core.gp.linalg import alike, congruence, multiply, symmetrise, transpose
 from twin_core.gp.state_space import LinearModel, ModelArrays
 
@@ -243,5 +243,5 @@ def score(model: LinearModel, slopes: Slopes, observations: FloatArray, *, settl
     arrays = Slopes(*(np.ascontiguousarray(a, dtype=np.float64) for a in slopes))
     total, failed = _run(model.arrays, arrays, y, float(settle_tolerance), gradient, information)
     if failed >= 0:
-        raise ModelError(f"sample {failed}: a sensor without noise measures what is known exactly; give it some noise")
+        raise failure(model, failed)
     return Score(total, gradient, information)

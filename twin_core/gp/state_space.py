@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import numbers
 
 
 class ModelArrays(NamedTuple):
@@ -105,34 +106,38 @@ class LinearModel:
         ModelError
             A shape does not fit, a number is not finite, a variance is negative or infinite.
         """
-        mean = _floats(prior_mean, "prior_mean")
+        mean = numbers(prior_mean, "prior_mean")
         n, n_steps = mean.size, n_times - 1
-        if n_times < 1:
-            raise ModelError("the model needs at least one sample")
+        if mean.ndim != 1:
+            raise ModelError(f"prior_mean: has shape {mean.shape}, it must be (n_states,)")
+        if not isinstance(n_times, int | np.integer) or n_times < 1:
+            raise ModelError(f"n_times: the model needs at least one sample, not {n_times}")
         a = _stack(transition, n, "transition")
-        steps = np.zeros((n_steps, n)) if offset is None else np.broadcast_to(_floats(offset, "offset"), (n_steps, n))
         model = cls(
             a,
             _stack(process_cov, n, "process_cov"),
             _index(step_index, a.shape[0], n_steps),
-            np.ascontiguousarray(steps),
-            np.atleast_2d(_floats(observation, "observation")),
-            np.atleast_1d(_floats(noise_variance, "noise_variance")),
+            numbers(0.0 if offset is None else offset, "offset", (n_steps, n)),
+            np.atleast_2d(numbers(observation, "observation")),
+            np.atleast_1d(numbers(noise_variance, "noise_variance", lowest=0.0)),
             mean,
-            _floats(prior_cov, "prior_cov"),
+            numbers(prior_cov, "prior_cov"),
         )
         model._check()
         return model
 
     def with_prior(self, mean: FloatArray, cov: FloatArray) -> Self:
         """Return the model with another prior of the first state."""
-        changed = replace(self, prior_mean=_floats(mean, "prior_mean"), prior_cov=_floats(cov, "prior_cov"))
+        changed = replace(self, prior_mean=numbers(mean, "prior_mean"), prior_cov=numbers(cov, "prior_cov"))
         changed._check()
         return changed
 
     def observed(self, observations: FloatArray) -> FloatArray:
         """Return observations as contiguous (n_times, n_sensors); ModelError where the shape or an infinity is wrong."""
-        y = np.ascontiguousarray(observations, dtype=np.float64)
+        try:
+            y = np.ascontiguousarray(observations, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"observations: must be numbers, NaN where missing ({error})") from error
         if y.ndim == 1 and self.n_sensors == 1:
             y = y[:, None]
         if y.shape != (self.n_times, self.n_sensors):
@@ -147,24 +152,21 @@ class LinearModel:
         if self.process_cov.shape != self.transition.shape:
             shapes = f"{self.process_cov.shape} and {self.transition.shape}"
             raise ModelError(f"process_cov and transition differ in shape: {shapes}")
-        if self.prior_cov.shape != (n, n) or self.observation.shape[1] != n:
+        if self.prior_mean.shape != (n,) or self.prior_cov.shape != (n, n) or self.observation.shape[1:] != (n,):
             raise ModelError(f"prior_cov and observation must have {n} columns, as prior_mean has states")
         if self.noise_variance.shape != (self.n_sensors,):
             raise ModelError(f"noise_variance has {self.noise_variance.size} values for {self.n_sensors} sensors")
-        for name, diagonal in (("noise_variance", self.noise_variance), ("prior_cov", np.diag(self.prior_cov))):
-            if (diagonal < 0).any():
-                raise ModelError(f"{name}[{int(np.argmin(diagonal))}] is negative: {diagonal.min():g}")
-
-
-def _floats(values: FloatArray, name: str) -> FloatArray:
-    array = np.ascontiguousarray(values, dtype=np.float64)
-    if not np.isfinite(array).all():
-        raise ModelError(f"{name} holds a number that is not finite; use a large finite variance for what is unknown")
-    return array
+        if (np.einsum("dii->di", self.process_cov) < 0.0).any():
+            raise ModelError("process_cov: a variance is negative")
+        largest = float(np.abs(self.prior_cov).max(initial=0.0))
+        if np.abs(self.prior_cov - self.prior_cov.T).max(initial=0.0) > 1e-9 * largest:
+            raise ModelError("prior_cov: must be symmetric")
+        if np.linalg.eigvalsh(self.prior_cov).min(initial=0.0) < -1e-9 * largest:
+            raise ModelError("prior_cov: is no covariance, some combination of states has a negative variance")
 
 
 def _stack(values: FloatArray, n: int, name: str) -> FloatArray:
-    array = _floats(values, name)
+    array = numbers(values, name)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.shape[1:] != (n, n) or array.shape[0] == 0:
         raise ModelError(f"{name} has shape {array.shape}; it must be (n_distinct, {n}, {n})")

@@ -7,6 +7,7 @@ finished by Newton steps; the Hessian is the central difference of the exact gra
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
+from typing import Literal
 
 import numpy as np
 from scipy.special import gammaln
@@ -28,6 +29,14 @@ BLIND_STD = 2.0
 """Standard deviation of ln(parameter) from the data alone above which a direction is called not identifiable."""
 
 
+Outcome = Literal["maximum", "not at rest", "no maximum"]
+ADVICE: dict[Outcome, str] = {
+    "maximum": "None needed; heed the notices.",
+    "not at rest": "Start from where it stopped, or give priors to the parameters that trade for each other.",
+    "no maximum": "Give priors to the parameters that the notices name, or hold them: the data leave them open.",
+}
+
+
 @dataclass(frozen=True)
 class GammaPrior:
     """Gamma distribution, density proportional to x^(shape - 1) exp(-rate x); ``rate`` in 1/unit."""
@@ -37,7 +46,7 @@ class GammaPrior:
 
     def __post_init__(self) -> None:
         """Refuse what is not a distribution."""
-        if not (self.shape > 0 and self.rate > 0):
+        if not (0 < self.shape < np.inf and 0 < self.rate < np.inf):
             raise ModelError(f"Gamma prior: shape and rate must be positive, they are {self.shape} and {self.rate}")
 
     def log_density(self, x: FloatArray | float) -> FloatArray:
@@ -57,13 +66,14 @@ class MapFit:
     values : (n_free,)
         At the maximum.
     covariance : (n_free, n_free)
-        Laplace: inverse of the negative Hessian of ln p(y, values) in the values themselves (eq. 32).
+        Laplace: inverse of the negative Hessian of ln p(y, values) in the values themselves (eq. 32); NaN without a
+        maximum.
     log_covariance : (n_free, n_free)
         The same in their logarithms, better where a posterior is wide.
     log_likelihood, log_posterior
         ln p(y | values), and with the prior density (not normalised by the evidence).
-    converged
-        Whether the climb ended at a maximum.
+    outcome
+        How the climb ended; :attr:`advice` tells what to do about it.
     n_steps
         Steps of the climb.
     notices
@@ -76,9 +86,19 @@ class MapFit:
     log_covariance: FloatArray
     log_likelihood: float
     log_posterior: float
-    converged: bool
+    outcome: Outcome
     n_steps: int
     notices: tuple[str, ...] = ()
+
+    @property
+    def converged(self) -> bool:
+        """Whether the climb ended at a maximum."""
+        return self.outcome == "maximum"
+
+    @property
+    def advice(self) -> str:
+        """What to do about the outcome."""
+        return ADVICE[self.outcome]
 
     @property
     def std(self) -> FloatArray:
@@ -96,6 +116,9 @@ class Posterior:
     def __init__(self, model: ForceModel, observations: FloatArray, priors: Mapping[str, GammaPrior]) -> None:
         """Take a model, samples (n_times, n_sensors), and priors by parameter name; a name without prior is flat."""
         unknown = set(priors) - set(model.names)
+        for name, prior in priors.items():
+            if not isinstance(prior, GammaPrior):
+                raise ModelError(f"prior for '{name}': must be a GammaPrior, it is {prior!r}")
         if unknown:
             raise ModelError(f"prior for '{sorted(unknown)[0]}': the parameters are {', '.join(model.names)}")
         self.model, self.observations = model, observations
@@ -178,7 +201,13 @@ def fit_map(
     posterior = Posterior(model, observations, priors)
     if set(start) != set(model.names):
         raise ModelError(f"start must name the parameters {', '.join(model.names)}; it names {', '.join(start)}")
-    points = [np.log(p) for p in product(*(np.atleast_1d(start[name]) for name in model.names))]
+    if not model.names:
+        raise ModelError("the model has no parameter to fit: give it a latent force, or names of parameters")
+    tried = {name: np.atleast_1d(np.asarray(start[name], dtype=np.float64)) for name in model.names}
+    for name, values in tried.items():
+        if not (values.size and (values > 0.0).all() and np.isfinite(values).all()):
+            raise ModelError(f"start of '{name}': must be positive, it is {start[name]}")
+    points = [np.log(p) for p in product(*tried.values())]
     ranked = [(posterior.value(p), k) for k, p in enumerate(points)] if len(points) > 1 else [(0.0, 0)]
     best, which = max(ranked)
     if not np.isfinite(best):
@@ -223,16 +252,14 @@ def _laplace(posterior: Posterior, point: FloatArray, n_steps: int, converged: b
     value, likelihood, gradient, _ = posterior.expand(point)
     values = np.exp(point)
     notices = _blind_directions(posterior, point, hessian)
-    if not converged:
-        notices = (*notices, f"the climb did not come to rest in {n_steps} steps: some parameters trade for each other")
     curvature = (hessian - np.diag(gradient)) / np.outer(values, values)
     names = posterior.model.names
     if np.linalg.eigvalsh(hessian).max() >= 0:
-        notices = (*notices, "the posterior is flat or not at a maximum: no covariance")
         blank = np.full(hessian.shape, np.nan)
-        return MapFit(names, values, blank, blank, likelihood, value, False, n_steps, notices)
+        return MapFit(names, values, blank, blank, likelihood, value, "no maximum", n_steps, notices)
     covariance, log_covariance = (np.asarray(np.linalg.inv(-m), dtype=np.float64) for m in (curvature, hessian))
-    return MapFit(names, values, covariance, log_covariance, likelihood, value, converged, n_steps, notices)
+    outcome: Outcome = "maximum" if converged else "not at rest"
+    return MapFit(names, values, covariance, log_covariance, likelihood, value, outcome, n_steps, notices)
 
 
 def _blind_directions(posterior: Posterior, point: FloatArray, hessian: FloatArray) -> tuple[str, ...]:

@@ -39,18 +39,21 @@ class Linearised:
 
     def __post_init__(self) -> None:
         """Check the shapes; ModelError names the first that does not fit."""
-        n, n_steps = self.n_nodes, self.time_s.size - 1
-        if self.time_s.ndim != 1 or n_steps < 0:
+        if np.ndim(self.time_s) != 1 or np.size(self.time_s) < 1:
             raise ModelError("time_s must be (n_times,) with at least one sample")
+        n, n_steps = self.n_nodes, np.size(self.time_s) - 1
         for name, rows in (("jacobian_per_s", (n, n)), ("capacity_J_per_K", (n,))):
             shape = getattr(self, name).shape
             if shape not in ((1, *rows), (n_steps, *rows)):
                 raise ModelError(f"{name} has shape {shape}; it must be (1 or {n_steps}, {', '.join(map(str, rows))})")
         if self.constant_K_per_s.shape != (n_steps, 2, n):
             raise ModelError(f"constant_K_per_s has shape {self.constant_K_per_s.shape}, not {(n_steps, 2, n)}")
-        if not (np.real(self.capacity_J_per_K) > 0).all():
-            node = int(np.argwhere(~(np.real(self.capacity_J_per_K) > 0))[0, 1])
-            raise ModelError(f"node {node}: the capacity must be positive")
+        good = (np.real(self.capacity_J_per_K) > 0) & np.isfinite(self.capacity_J_per_K)
+        if not good.all():
+            raise ModelError(f"node {int(np.argwhere(~good)[0, 1])}: the capacity must be positive and finite")
+        for name in ("jacobian_per_s", "constant_K_per_s"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise ModelError(f"{name} holds a number that is not finite")
 
     @property
     def n_nodes(self) -> int:
@@ -91,8 +94,12 @@ class Linearised:
         jacobian = jacobian.mean(axis=1) if jacobian.ndim == 4 else jacobian
         jacobian = jacobian[None] if jacobian.ndim == 2 else _collapse(jacobian)
         ends = np.stack([nominal_K[:-1], nominal_K[1:]], axis=1)
-        if rate.shape != ends.shape:
+        if rate.shape != ends.shape or ends.ndim != 3:
             raise ModelError(f"rate_K_per_s has shape {rate.shape}, nominal_K asks for {ends.shape}")
+        if jacobian.shape[1:] != 2 * ends.shape[2:] or jacobian.shape[0] not in (1, ends.shape[0]):
+            raise ModelError(
+                f"jacobian_per_s has shape {jacobian.shape} for {ends.shape[0]} steps of {ends.shape[2]} nodes"
+            )
         constant = rate - (ends @ np.swapaxes(jacobian, -1, -2))
         return cls(times, jacobian, constant, _collapse(np.atleast_2d(capacity_J_per_K)))
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import numbers
 from twin_core.gp.discretise import Scheme, discretise, distinct_steps
 from twin_core.gp.kernels import Block, Kernel, Values
 from twin_core.gp.score import Slopes
@@ -23,6 +24,11 @@ from twin_core.latent_force.linearised import Linearised
 
 STEP = 1e-30
 """Imaginary step; its square is far below rounding, so derivatives are exact."""
+
+
+VAGUEST = 1e6
+"""Largest deviation of a first temperature over the finest sensor noise. The filter subtracts variances, so that it loses
+twice as many digits as this ratio has; at a million, smoothed states are still right to 1e-4 of their deviation."""
 
 
 @dataclass(frozen=True)
@@ -139,29 +145,27 @@ class ForceModel:
         if not forces:
             names = []
         network_index = tuple(range(len(names), len(names) + len(network_names)))
-        h = np.atleast_2d(np.asarray(observation, dtype=np.float64))
+        h = np.atleast_2d(numbers(observation, "observation"))
+        _check_places(nodes, estimate_noise, h, network)
         noise_index = np.full(h.shape[0], -1, dtype=np.int64)
         for position, sensor in enumerate(estimate_noise):
             noise_index[sensor] = len(names) + len(network_names) + position
         names += [*network_names, *(f"noise_std_K[{sensor}]" for sensor in estimate_noise)]
         n = h.shape[1]
-        model = cls(
+        noise = numbers(noise_std_K, "noise_std_K", (h.shape[0],), lowest=0.0)
+        return cls(
             tuple(names),
             (lambda values: network) if isinstance(network, Linearised) else network,
             network_index,
             forces,
             h,
-            np.broadcast_to(np.asarray(noise_std_K, dtype=np.float64), (h.shape[0],)).copy(),
+            noise,
             noise_index,
-            np.broadcast_to(np.asarray(prior_mean_K, dtype=np.float64), (n,)).copy(),
-            np.broadcast_to(np.asarray(prior_std_K, dtype=np.float64), (n,)).copy(),
-            np.broadcast_to(np.asarray(drift_K2_per_s, dtype=np.float64), (n,)).copy(),
+            numbers(prior_mean_K, "prior_mean_K", (n,)),
+            _prior_std_K(prior_std_K, n, noise),
+            numbers(drift_K2_per_s, "drift_K2_per_s", (n,), lowest=0.0),
             scheme,
         )
-        for node in nodes:
-            if not 0 <= node < n:
-                raise ModelError(f"force on node {node}: the network has nodes 0 to {n - 1}")
-        return model
 
     @property
     def n_nodes(self) -> int:
@@ -187,7 +191,8 @@ class ForceModel:
         at = np.asarray(values, dtype=np.float64)
         network = self.network(at[list(self.network_index)])
         steps, index = step_table(network)
-        moved = [np.asarray(np.real(a), dtype=np.float64) for a in self._assemble(at, network, steps, index)]
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is named by the discretisation
+            moved = [np.asarray(np.real(a), dtype=np.float64) for a in self._assemble(at, network, steps, index)]
         observation = np.hstack([self.observation, np.zeros((self.observation.shape[0], moved[4].size - self.n_nodes))])
         return LinearModel.build(
             transition=moved[0],
@@ -231,6 +236,36 @@ class ForceModel:
             cov[at : at + size, at : at + size] = block.stationary_cov
             at += size
         return discrete.transition, discrete.process_cov, offset, noise**2, mean, cov
+
+
+def _check_places(
+    nodes: Sequence[int], noisy: Sequence[int], h: FloatArray, network: Linearised | Callable[[Values], Linearised]
+) -> None:
+    """Refuse forces and estimated noises that have no place, or one between two; ModelError names it."""
+    n_sensors, n = h.shape
+    if isinstance(network, Linearised) and network.n_nodes != n:
+        raise ModelError(f"observation has {n} columns, the network {network.n_nodes} nodes")
+    for what, places, count in (("force on node", nodes, n), ("noise of sensor", noisy, n_sensors)):
+        for place in places:
+            if not isinstance(place, int | np.integer) or not 0 <= place < count:
+                raise ModelError(f"{what} {place}: there are 0 to {count - 1}")
+        if len(set(places)) < len(places):
+            raise ModelError(f"{what} {next(p for p in places if list(places).count(p) > 1)}: is named twice")
+
+
+def _prior_std_K(given: FloatArray | float, n: int, noise_std_K: FloatArray) -> FloatArray:
+    """Return the deviations of the first temperatures; refuse what a filter in double precision cannot carry."""
+    if np.isinf(given).any():
+        raise ModelError("prior_std_K: is infinite; no temperature is further than 1000 K from any guess, give that")
+    std = numbers(given, "prior_std_K", (n,), lowest=0.0)
+    limit = VAGUEST * float(noise_std_K[noise_std_K > 0.0].min(initial=np.inf))
+    if (std > limit).any():
+        node = int(np.argmax(std))
+        raise ModelError(
+            f"prior_std_K[{node}]: {std[node]:g} K beside a sensor noise of {limit / VAGUEST:g} K is more than double "
+            f"precision carries; give at most {limit:g} K, or 1000 K: no temperature is further from any guess"
+        )
+    return std
 
 
 def step_table(network: Linearised) -> tuple[FloatArray, IntArray]:

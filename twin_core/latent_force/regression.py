@@ -16,6 +16,7 @@ from scipy.special import logsumexp
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
 from twin_core.gp.basis import Basis
+from twin_core.gp.checked import numbers
 from twin_core.gp.columns import WhiteRegression, whiten_responses
 from twin_core.gp.discretise import discretise
 from twin_core.gp.polynomial import ForcePolynomial
@@ -114,6 +115,16 @@ def learn_heat_flow(
     picked = tuple(range(len(model.forces))) if only is None else tuple(only)
     if not picked:
         raise ModelError("the model has no latent force to learn a heat flow from")
+    n_times = observations.shape[0]
+    for k in picked:
+        if not 0 <= k < len(model.forces):
+            raise ModelError(f"only: there is no force {k}, the model has {len(model.forces)}")
+    if smoothed.time_s.size != n_times or smoothed.mean_W.shape[1] != len(model.forces):
+        raise ModelError(f"smoothed has {smoothed.mean_W.shape} forces, the model needs {(n_times, len(model.forces))}")
+    if max_degree < 0 or (vanishing and max_degree < 1):
+        raise ModelError(f"max_degree must be at least {int(bool(vanishing))}, it is {max_degree}")
+    if boundary_K is not None:
+        boundary_K = numbers(boundary_K, "boundary_K", (n_times,))
     _refuse_shared(model, picked)
     forms = [vanishing] if vanishing is not None else [False] if boundary_K is None else [False, True]
     learned = [

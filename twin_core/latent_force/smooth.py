@@ -73,7 +73,7 @@ def smooth_force(model: ForceModel, observations: FloatArray, values: FloatArray
         A shape is wrong or a parameter is not positive.
     """
     at = np.asarray(values, dtype=np.float64)
-    if at.shape != (len(model.names),) or not (at > 0).all():
+    if at.shape != (len(model.names),) or not ((at > 0) & np.isfinite(at)).all():
         raise ModelError(f"values must be {len(model.names)} positive numbers: {', '.join(model.names)}")
     linear = model.linear_model(at)
     filtered = kalman_filter(linear, observations)
@@ -121,6 +121,8 @@ def smooth_extended(
     ModelError
         As :func:`smooth_force`; or the network has parameters of its own.
     """
+    if max_linearisations < 1:
+        raise ModelError(f"max_linearisations must be at least 1, it is {max_linearisations}")
     if model.network_index:
         raise ModelError("the extended smoother takes a network without free parameters")
     found = smooth_force(model, observations, values)

@@ -21,10 +21,12 @@ def extrapolations(
     Parameters
     ----------
     network, forcing, path
-        A converged rollout.
+        A rollout; nothing is told of one that has not converged.
     effects
         Those of the network, at its values.
     """
+    if not path.converged:
+        return []
     n_steps, n_nodes = forcing.n_steps, len(network.nodes)
     boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(0, n_steps))
     along = forcing.along(path.stages_K.reshape(-1, n_nodes), boundaries, 0, n_steps)

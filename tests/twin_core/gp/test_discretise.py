@@ -126,5 +126,18 @@ def test_time_must_increase(time):
 def test_bad_dynamics_are_told():
     with pytest.raises(ModelError, match="steps must be positive"):
         discretise(np.zeros((1, 1)), np.zeros((1, 1)), np.array([0.0]))
-    with pytest.raises(ModelError, match="positive capacity"):
+    with pytest.raises(ModelError, match="a parameter is too large or small"):
         discretise(np.array([[np.inf]]), np.zeros((1, 1)), np.array([1.0]))
+
+
+@pytest.mark.parametrize(
+    ("feedback", "diffusion", "scheme", "words"),
+    [
+        (np.eye(2), np.eye(3), "exact", "square and of one size"),
+        (np.zeros((2, 3)), np.zeros((2, 3)), "exact", "square and of one size"),
+        (np.eye(2), np.eye(2), "second-order", "scheme: must be one of exact, first-order"),
+    ],
+)
+def test_shapes_and_schemes_are_told(feedback, diffusion, scheme, words):
+    with pytest.raises(ModelError, match=words):
+        discretise(feedback, diffusion, np.ones(1), scheme=scheme)

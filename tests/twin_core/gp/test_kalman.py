@@ -131,8 +131,8 @@ def test_without_noise_the_sample_is_the_state():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"prior_cov": [[np.inf]]}, "prior_cov holds a number that is not finite"),
-        ({"noise_variance": [-1.0]}, "noise_variance.0. is negative"),
+        ({"prior_cov": [[np.inf]]}, "prior_cov: holds a number that is not finite"),
+        ({"noise_variance": [-1.0]}, "noise_variance: must be at least 0, one is -1"),
         ({"noise_variance": [1.0, 1.0]}, "2 values for 1 sensors"),
         ({"transition": np.eye(2)}, "transition has shape"),
         ({"transition": np.ones((3, 1, 1))}, "step_index must say"),
@@ -140,12 +140,47 @@ def test_without_noise_the_sample_is_the_state():
         ({"step_index": [0]}, "step_index has shape"),
         ({"process_cov": np.ones((2, 1, 1))}, "differ in shape"),
         ({"n_times": 0}, "at least one sample"),
+        ({"n_times": 2.5}, "at least one sample, not 2.5"),
         ({"observation": [[1.0, 2.0]]}, "must have 1 columns"),
+        ({"observation": np.ones((1, 1, 1))}, "must have 1 columns"),
+        ({"offset": np.zeros((3, 1))}, r"offset: has shape \(3, 1\), it must have \(4, 1\)"),
+        ({"prior_mean": ["warm"]}, "prior_mean: must be numbers"),
+        ({"prior_mean": [[0.0]]}, r"prior_mean: has shape \(1, 1\)"),
+        ({"process_cov": -np.eye(1)}, "process_cov: a variance is negative"),
     ],
 )
 def test_a_wrong_model_is_told(changes, words):
     with pytest.raises(ModelError, match=words):
         _scalar(**{"n_times": 5, **changes})
+
+
+@pytest.mark.parametrize(
+    ("cov", "words"),
+    [([[1.0, 0.5], [-0.5, 1.0]], "prior_cov: must be symmetric"), ([[1.0, 5.0], [5.0, 1.0]], "is no covariance")],
+)
+def test_what_is_no_covariance_is_told(cov, words):
+    with pytest.raises(ModelError, match=words):
+        LinearModel.build(
+            transition=np.eye(2),
+            process_cov=np.eye(2),
+            observation=np.eye(2),
+            noise_variance=np.ones(2),
+            prior_mean=np.zeros(2),
+            prior_cov=np.array(cov),
+            n_times=3,
+        )
+
+
+def test_a_tolerance_that_is_no_number_never_settles():
+    y = np.arange(50.0)
+    never, nan = (kalman_filter(_scalar(50), y, settle_tolerance=t) for t in (-1.0, np.nan))
+    np.testing.assert_array_equal(nan.mean, never.mean)
+    assert not nan.settled.any()
+
+
+def test_an_unknown_wish_is_told():
+    with pytest.raises(ModelError, match="keep: must be one of likelihood, innovations, states, all"):
+        kalman_filter(_scalar(3), np.zeros(3), keep="everything")
 
 
 def test_wrong_observations_are_told():

@@ -10,7 +10,7 @@ from twin_core.latent_force.hyperparameters import GammaPrior, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.regression import learn_heat_flow
-from twin_core.latent_force.smooth import smooth_force
+from twin_core.latent_force.smooth import smooth_extended, smooth_force
 
 TIMES = np.arange(0.0, 300.0, 5.0)
 CAPACITY = 50.0
@@ -56,16 +56,147 @@ def test_without_noise_the_temperatures_are_the_samples():
 
 
 def test_infinite_prior_is_told():
-    with pytest.raises(ModelError, match="prior_cov holds a number that is not finite"):
-        smooth_force(_model(prior_std_K=np.inf), _truth()[0], VALUES)
+    with pytest.raises(ModelError, match="prior_std_K: is infinite; no temperature is further than 1000 K"):
+        _model(prior_std_K=[1.0, np.inf])
 
 
-def test_vague_prior_is_the_limit():
-    """1e5 K and 1e6 K of ignorance say the same."""
-    states, _ = _truth()
-    wide, wider = (smooth_force(_model(prior_std_K=s), states, VALUES) for s in (1e5, 1e6))
-    np.testing.assert_allclose(wide.mean_W, wider.mean_W, atol=1e-5)
-    np.testing.assert_allclose(wide.std_W, wider.std_W, rtol=1e-5)
+def _least_squares(model: ForceModel, samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and deviation of every state by one QR of all equations: vague rows are small, no variance is lost."""
+    linear = model.linear_model(VALUES)
+    n, n_times = linear.n_states, linear.n_times
+    rows, right = [], []
+
+    def add(at: int, block: np.ndarray, value: np.ndarray) -> None:
+        wide = np.zeros((block.shape[0], n * n_times))
+        wide[:, n * at : n * at + block.shape[1]] = block
+        rows.append(wide)
+        right.append(value)
+
+    add(0, np.diag(1.0 / np.sqrt(np.diag(linear.prior_cov))), linear.prior_mean / np.sqrt(np.diag(linear.prior_cov)))
+    for k, d in enumerate(linear.step_index):
+        weight = np.linalg.inv(np.linalg.cholesky(linear.process_cov[d]))
+        add(k, weight @ np.hstack([-linear.transition[d], np.eye(n)]), weight @ linear.offset[k])
+    for k in range(n_times):
+        seen = np.isfinite(samples[k])
+        weight = 1.0 / np.sqrt(linear.noise_variance[seen])
+        add(k, weight[:, None] * linear.observation[seen], weight * samples[k, seen])
+    q, r = np.linalg.qr(np.vstack(rows))
+    inverse = np.linalg.inv(r)
+    mean = inverse @ (q.T @ np.concatenate(right))
+    return mean.reshape(n_times, n), np.sqrt((inverse**2).sum(axis=1)).reshape(n_times, n)
+
+
+@pytest.mark.parametrize("prior_std_K", [1.0, 1e3, 4e4])
+def test_a_vague_prior_is_as_good_as_any(prior_std_K):
+    """One of two nodes without a sensor, a heat on it, gaps: the whole posterior against least squares, up to the limit."""
+    rng = np.random.default_rng(3)
+    samples = (_truth()[0] + 0.05 * rng.normal(size=(TIMES.size, 2)))[:, :1]
+    samples[5:9] = np.nan
+    model = _model(prior_std_K=prior_std_K, observation=np.array([[1.0, 0.0]]), noise_std_K=[0.05], drift_K2_per_s=1e-6)
+    mean, std = _least_squares(model, samples)
+    found = smooth_force(model, samples, VALUES)
+    n = model.n_nodes
+    np.testing.assert_allclose(found.temperature_std_K, std[:, :n], rtol=1e-4)
+    np.testing.assert_allclose(found.std_W[:, 0], std[:, n], rtol=1e-4)
+    assert (np.abs(found.temperature_K - mean[:, :n]) < 1e-4 * std[:, :n]).all()
+    assert (np.abs(found.mean_W[:, 0] - mean[:, n]) < 1e-4 * std[:, n]).all()
+
+
+def test_a_prior_beyond_double_precision_is_told():
+    for noise, prior in ((0.05, 6e4), (1e-4, 200.0)):
+        with pytest.raises(ModelError, match=r"prior_std_K\[1\]: .* more than double precision carries; give at most"):
+            _model(noise_std_K=[0.3, noise], prior_std_K=[1.0, prior])
+    _model(noise_std_K=[0.0, 0.0], prior_std_K=1e3)
+
+
+def _network(**change) -> Linearised:
+    steps = TIMES.size - 1
+    parts = {"jacobian_per_s": LOSSY[None], "constant_K_per_s": np.zeros((steps, 2, 2))}
+    return Linearised(**{"time_s": TIMES, "capacity_J_per_K": np.full((1, 2), CAPACITY)} | parts | change)
+
+
+def _built(**change):
+    given = {"observation": np.eye(2), "noise_std_K": 0.05, "prior_mean_K": 0.0, "prior_std_K": 0.5, "nodes": (1,)}
+    given |= {"network": _network(), "kernel": Matern(1)} | change
+    return ForceModel.build(given.pop("network"), given.pop("nodes"), given.pop("kernel"), **given)
+
+
+SAMPLES = np.zeros((TIMES.size, 2))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: _built(noise_std_K=[-0.1, 0.1]), "noise_std_K: must be at least 0"),
+        (lambda: _built(noise_std_K=[0.1, np.nan]), "noise_std_K: holds a number that is not finite"),
+        (lambda: _built(noise_std_K=[0.1] * 3), r"noise_std_K: has shape \(3,\), it must have \(2,\)"),
+        (lambda: _built(prior_std_K=-1.0), "prior_std_K: must be at least 0"),
+        (lambda: _built(prior_mean_K=[np.nan, 0.0]), "prior_mean_K: holds a number that is not finite"),
+        (lambda: _built(prior_mean_K="warm"), "prior_mean_K: must be numbers"),
+        (lambda: _built(drift_K2_per_s=-1.0), "drift_K2_per_s: must be at least 0"),
+        (lambda: _built(observation=np.eye(3)), "observation has 3 columns, the network 2 nodes"),
+        (lambda: _built(nodes=(7,)), "force on node 7: there are 0 to 1"),
+        (lambda: _built(nodes=(0.5,)), "force on node 0.5: there are 0 to 1"),
+        (lambda: _built(nodes=(1, 1)), "force on node 1: is named twice"),
+        (lambda: _built(estimate_noise=(5,)), "noise of sensor 5: there are 0 to 1"),
+        (lambda: _built(estimate_noise=(-1,)), "noise of sensor -1: there are 0 to 1"),
+        (lambda: _built(estimate_noise=(0, 0)), "noise of sensor 0: is named twice"),
+        (
+            lambda: smooth_force(_built(scheme="third-order"), SAMPLES, VALUES),
+            "scheme: must be one of exact, first-order",
+        ),
+        (lambda: smooth_force(_built(), SAMPLES, VALUES * np.inf), "2 positive numbers"),
+        (lambda: smooth_force(_built(), SAMPLES, np.array([1e200, 60.0])), "a parameter is too large or small"),
+        (lambda: smooth_force(_built(), [["a", "b"]] * TIMES.size, VALUES), "observations: must be numbers"),
+        (lambda: smooth_extended(_built(), lambda t: _network(), SAMPLES, VALUES, max_linearisations=0), "at least 1"),
+        (lambda: _network(capacity_J_per_K=np.array([[50.0, np.inf]])), "node 1: the capacity must be positive"),
+        (lambda: _network(capacity_J_per_K=np.array([[0.0, 1.0]])), "node 0: the capacity must be positive"),
+        (lambda: _network(jacobian_per_s=LOSSY[None] * np.nan), "jacobian_per_s holds a number that is not finite"),
+        (lambda: _network(time_s=3.0), "time_s must be"),
+        (
+            lambda: Linearised.about(TIMES, SAMPLES, SAMPLES, np.eye(3), np.ones(2)),
+            r"shape \(1, 3, 3\) for 59 steps of 2",
+        ),
+        (
+            lambda: fit_map(_built(), SAMPLES, PRIORS, {"std": -2.0, "length_s": 20.0}),
+            "start of 'std': must be positive",
+        ),
+        (lambda: fit_map(_built(), SAMPLES, PRIORS, {"std": (), "length_s": 20.0}), "start of 'std': must be positive"),
+        (lambda: fit_map(_built(), SAMPLES, {"std": 3.0}, {"std": 2.0, "length_s": 20.0}), "must be a GammaPrior"),
+        (lambda: fit_map(_built(nodes=()), SAMPLES, {}, {}), "no parameter to fit"),
+        (lambda: GammaPrior(np.inf, 1.0), "shape and rate must be positive"),
+        (lambda: Matern(1, decay=-1.0), "decay must be positive"),
+    ],
+)
+def test_nonsense_is_named_at_the_door(call, words):
+    with pytest.raises(ModelError, match=words):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"only": (4,)}, "there is no force 4"),
+        ({"max_degree": -1}, "max_degree must be at least 0"),
+        ({"degree": -1}, "degree must be at least 0"),
+        ({"boundary_K": np.zeros(3)}, "boundary_K: has shape"),
+        ({"boundary_K": np.full(TIMES.size, np.nan)}, "boundary_K: holds a number that is not finite"),
+        ({"vanishing": True}, "needs the boundary temperature"),
+    ],
+)
+def test_a_regression_that_cannot_be_is_named(change, words):
+    model = _built()
+    found = smooth_force(model, SAMPLES, VALUES)
+    with pytest.raises(ModelError, match=words):
+        learn_heat_flow(model, SAMPLES, VALUES, found, **change)
+
+
+def test_a_regression_along_another_record_is_named():
+    model = _built()
+    found = smooth_force(model, SAMPLES, VALUES)
+    short = _built(network=_network(time_s=TIMES[:10], constant_K_per_s=np.zeros((9, 2, 2))))
+    with pytest.raises(ModelError, match="smoothed has"):
+        learn_heat_flow(short, SAMPLES[:10], VALUES, found)
 
 
 def test_nothing_seen_leaves_the_prior():
@@ -133,3 +264,11 @@ def test_separate_hyperparameters_tell_the_forces_apart():
     priors = {f"{name}[{k}]": PRIORS[name] for name in PRIORS for k in (0, 1)}
     fit = fit_map(apart, y, priors, {"std[0]": 2.0, "length_s[0]": 40.0, "std[1]": 2.0, "length_s[1]": 40.0}).named()
     assert fit["std[0]"] < 0.5 * fit["std[1]"]
+
+
+def test_without_samples_and_priors_there_is_no_maximum():
+    blank = np.full((TIMES.size, 2), np.nan)
+    found = fit_map(_model(), blank, {}, {"std": 2.0, "length_s": 20.0})
+    assert (found.outcome, found.converged) == ("no maximum", False)
+    assert "Give priors" in found.advice and np.isnan(found.covariance).all()
+    assert any("std" in notice and "not identifiable" in notice for notice in found.notices)

@@ -76,7 +76,7 @@ def test_maximum_is_that_of_another_optimiser():
     other = minimize(
         lambda p: -posterior.value(p), np.log([4.0, 60.0]), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}
     )
-    assert found.converged
+    assert found.converged and (found.outcome, found.advice) == ("maximum", "None needed; heed the notices.")
     np.testing.assert_allclose(found.values, np.exp(other.x), rtol=1e-4)
     assert found.log_likelihood == pytest.approx(smooth_force(model, y, found.values).log_likelihood, abs=1e-9)
     assert found.log_posterior == pytest.approx(-other.fun, abs=1e-8)
