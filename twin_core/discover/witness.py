@@ -17,6 +17,7 @@ from twin_core.discover.search import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
 from twin_core.gp.polynomial import ForcePolynomial
+from twin_core.latent_force.declared import declared_model
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
 from twin_core.latent_force.regression import learn_heat_flow
@@ -240,13 +241,12 @@ def _smoothed(fit: HeatFit, nodes: Sequence[str]) -> tuple[LatentForce, ForceMod
 def _model(fit: HeatFit, nominal: Nominal, view: _View, at: Sequence[int], states_K: FloatArray) -> ForceModel:
     """Return the declared network with a Matérn-1/2 force (the paper's) on some nodes."""
     network, segment = fit.network, nominal.segment
-    observation = np.zeros((network.sensor_node.size, len(network.nodes)))
-    observation[np.arange(network.sensor_node.size), network.sensor_node] = 1.0
-    return ForceModel.build(
-        linearise_network(network, view.forcing)(states_K),
-        at,
+    return declared_model(
+        network,
+        view.forcing,
+        states_K,
+        [network.nodes[i] for i in at],
         Matern(1),
-        observation=observation,
         noise_std_K=fit.problem.noise_K,
         prior_mean_K=segment.start_prior_K if view.first_step == 0 else states_K[0],
         prior_std_K=segment.start_std_K,

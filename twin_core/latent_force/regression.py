@@ -20,7 +20,8 @@ from twin_core.gp.checked import numbers
 from twin_core.gp.columns import WhiteRegression, whiten_responses
 from twin_core.gp.discretise import discretise
 from twin_core.gp.polynomial import ForcePolynomial
-from twin_core.latent_force.model import Force, ForceModel, augment, drive, step_table
+from twin_core.latent_force.augment import Force, augment, drive, step_table
+from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.smooth import LatentForce
 
 MISFIT_SHARES = (1e-4, 1e-2, 3e-2, 0.1, 0.3, 1.0)

@@ -7,8 +7,9 @@ from scipy.linalg import expm
 from twin_core.errors import ModelError
 from twin_core.gp.kernels import Matern, Periodic
 from twin_core.gp.score import Slopes
+from twin_core.latent_force.augment import drive
 from twin_core.latent_force.linearised import Linearised
-from twin_core.latent_force.model import ForceModel, drive
+from twin_core.latent_force.model import ForceModel
 
 CAPACITY = np.array([[200.0, 500.0]])
 TIMES = np.array([0.0, 10.0, 20.0, 35.0, 45.0])
