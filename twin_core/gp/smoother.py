@@ -14,7 +14,7 @@ from numba import njit
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.errors import ModelError
 from twin_core.gp.kalman import SETTLED, Filtered
-from twin_core.gp.linalg import alike, cholesky, congruence, multiply, solve_cholesky, symmetrise, transpose
+from twin_core.gp.linalg import alike, cholesky, congruence, multiply, solve_cholesky, transpose
 from twin_core.gp.state_space import LinearModel, ModelArrays
 
 
@@ -62,7 +62,7 @@ class _Store(NamedTuple):
 
 @njit(cache=True)
 def _prepare_gain(a: FloatArray, q: FloatArray, cov: FloatArray, s: _Scratch) -> None:
-    """Fill ``gain`` = G and ``reduced`` = (I - G A) P (I - G A)ᵀ + G Q Gᵀ."""
+    """Fill ``gain`` = G and ``reduced`` = (I - G A) P (I - G A)ᵀ."""
     n = cov.shape[0]
     congruence(a, cov, s.forward, s.turned, s.ahead)
     for i in range(n):
@@ -77,10 +77,6 @@ def _prepare_gain(a: FloatArray, q: FloatArray, cov: FloatArray, s: _Scratch) ->
             s.work[i, j] = -s.work[i, j]
         s.work[i, i] += 1.0
     congruence(s.work, cov, s.forward, s.turned, s.reduced)
-    congruence(s.gain, q, s.forward, s.turned, s.ahead)
-    for i in range(n):
-        for j in range(n):
-            s.reduced[i, j] += s.ahead[i, j]
 
 
 @njit(cache=True)
@@ -100,14 +96,17 @@ def _correct_mean(
 
 
 @njit(cache=True)
-def _correct_cov(cov: FloatArray, s: _Scratch) -> None:
+def _correct_cov(q: FloatArray, cov: FloatArray, s: _Scratch) -> None:
     """Replace the later step's smoothed covariance by this step's; the later one stays in ``later``."""
-    s.later[:] = cov
-    congruence(s.gain, s.later, s.work, s.turned, cov)
-    for i in range(cov.shape[0]):
-        for j in range(cov.shape[0]):
-            cov[i, j] += s.reduced[i, j]
-    symmetrise(cov)
+    n = cov.shape[0]
+    for i in range(n):
+        for j in range(n):
+            s.later[i, j] = cov[i, j]
+            cov[i, j] += q[i, j]
+    congruence(s.gain, cov, s.work, s.turned, s.ahead)
+    for i in range(n):
+        for j in range(n):
+            cov[i, j] = s.ahead[i, j] + s.reduced[i, j]
 
 
 @njit(cache=True)
@@ -134,7 +133,7 @@ def _run(
                 transpose(s.gain, s.turned)
                 multiply(cov, s.turned, store.lag_one_cov[k])
             if not steady:
-                _correct_cov(cov, s)
+                _correct_cov(model.process_cov[d], cov, s)
                 steady = repeats and alike(cov, s.later, tolerance)
         store.mean[k] = mean
         for i in range(n):
