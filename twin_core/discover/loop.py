@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
+from twin_core.discover.screen import survey_of
 from twin_core.discover.search import Search, search
 from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
@@ -80,7 +81,7 @@ def close_loop(
     before = to_model(calibration, ())
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
     found = search(base, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m))
-    after = to_model(found.trial.calibration, found.trial.present_effects) if found.findings else before
+    after = corrected(found) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found))
@@ -91,6 +92,15 @@ def close_loop(
     report["elapsed_s"] = time.perf_counter() - begun
     progress(1.0, "done")
     return ClosedLoop(report, after, before, plots)
+
+
+def corrected(found: Search) -> CalibratedModel:
+    """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
+    survey = survey_of(found.trial.fit)
+    model = to_model(found.trial.calibration, found.trial.present_effects)
+    effects = tuple(effect.centred(survey) for effect in model.effects)
+    moved = {p.name: p.value for effect in effects for p in effect.parameters()}
+    return replace(model, effects=effects, values=model.values | moved)
 
 
 def _split(

@@ -26,7 +26,7 @@ def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
     for quality in effect.qualities():
         mean = effect.presented(quality)
         std = stds.get(f"{effect.label}.{quality.name}")
-        std = None if std is None else float(np.hypot(std, quality.resolution))
+        std = None if std is None else quality.spread(std)
         base, bracket, _ = quality.name.partition("[")
         if bracket:
             row = rows.setdefault(base, {"mean": [], "std": []})

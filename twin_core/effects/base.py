@@ -39,7 +39,7 @@ class Quality:
     lower
         The least value, itself possible; None where there is none or the value is positive anyway.
     resolution
-        Standard deviation of what no telemetry can tell, beyond what the fit tells.
+        Standard deviation of what no fit to this telemetry can tell: it adds to that of the fit.
     instant
         For an instant on the clock of ``Record.clock_s``: where the solver counts from, and in what; None for others.
     """
@@ -59,6 +59,16 @@ class Quality:
         if self.positive:
             return Log()
         return self.instant or (Identity() if self.lower is None else Floored(self.lower))
+
+    def spread(self, fitted: float) -> float:
+        """Return the standard deviation, given that of a fit; one as wide as its prior says that the fit tells nothing."""
+        if (
+            self.instant is not None
+            and self.resolution > 0.0
+            and fitted > 0.5 * self.instant.scale * (self.prior_std or np.inf)
+        ):
+            return self.resolution
+        return float(np.hypot(fitted, self.resolution))
 
     def moved(self, amount: float) -> float | None:
         """Return the value at a distance from null, None if it is not positive but must be.
@@ -195,6 +205,10 @@ class Effect(ABC):
     def refined(self, survey: Survey) -> Iterable[Self]:
         """Yield starts between this one and its neighbours, where ``starts`` is too coarse for a local search; or none."""
         return ()
+
+    def centred(self, survey: Survey) -> Self:
+        """Return the fitted effect with what the record leaves open put in the middle; most leave nothing open."""
+        return self
 
     def extra_nodes(self, layout: Layout) -> tuple[ExtraNode, ...]:
         """Return the states that the effect adds; none for most."""

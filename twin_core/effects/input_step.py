@@ -1,6 +1,7 @@
 """A heat input that changes at an instant: a dead heater, a lost string, a switch to a redundant circuit."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -30,6 +31,20 @@ class InputStep(OnsetEffect):
             return change * declared, [slope * declared for slope in slopes]
 
         return correct_channel(self, layout, shape, dated=self.settings["dated"])
+
+    def centred(self, survey: Survey) -> Self:
+        """Return the onset in the middle of the time in which the input is off, if it lies in or next to such a time."""
+        time, width = self.values["time"], self.settings["width_s"]
+        for window in survey.segments():
+            clock, off = survey.along.time_s[window], survey.along.inputs[self.where["channel"]][window] == 0.0
+            near = np.flatnonzero(off & (np.abs(clock - time) <= width))
+            if near.size:
+                on = np.concatenate([[-1], np.flatnonzero(~off), [off.size]])
+                after = int(np.searchsorted(on, near[0]))
+                begin, end = clock[on[after - 1] + 1], clock[on[after] - 1]
+                moved = self.with_values({"time": float(0.5 * (begin + end))})
+                return replace(moved, settings={**self.settings, "blind_s": float(end - begin)})
+        return self
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:

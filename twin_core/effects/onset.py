@@ -5,7 +5,7 @@ and no telemetry can tell the two apart.
 """
 
 from collections.abc import Iterable
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -14,10 +14,9 @@ from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.parameters.transforms import Shifted
 
 N_ONSETS = 28
+N_REFINED = 32
 MARGIN = 0.03
 """Onsets this close to an end of the record, as a share of its samples, are nobody's business: too little tells them."""
-
-N_REFINED = 32
 
 
 class OnsetEffect(Effect):
@@ -28,7 +27,13 @@ class OnsetEffect(Effect):
     def qualities(self) -> tuple[Quality, ...]:
         """Return the amplitude and the onset, which moves by the spacing of ``starts``; its prior spans the record."""
         clock = Shifted(self.settings["begin_s"], self.settings["span_s"] / N_ONSETS)
-        return self.amplitude, Quality("time", "s", prior_std=float(N_ONSETS), instant=clock)
+        resolution = self.blind_s / np.sqrt(12.0)
+        return self.amplitude, Quality("time", "s", prior_std=float(N_ONSETS), instant=clock, resolution=resolution)
+
+    @property
+    def blind_s(self) -> float:
+        """How long it is around the onset that nothing tells one instant from another."""
+        return float(self.settings.get("blind_s", 0.0))
 
     def ramp(self, clock_s: FloatArray, time_s: float) -> tuple[FloatArray, FloatArray]:
         """Return the share that has set in, from 0 to 1, and its derivative by the onset."""
@@ -48,34 +53,24 @@ class OnsetEffect(Effect):
         samples = np.unique(survey.sample_s)
         if samples.size < 3:
             return
-        ends = np.quantile(np.arange(samples.size), [MARGIN, 1.0 - MARGIN])
-        for k in _ranks(ends[0], ends[1], N_ONSETS, samples.size):
-            yield cls(where, cls._at(samples, k), _settings(samples, survey.dated))
+        begin, span = float(samples[0]), float(samples[-1] - samples[0])
+        settings = {"begin_s": begin, "span_s": span, "width_s": float(np.median(np.diff(samples)))}
+        null = cls(where, {cls.amplitude.name: cls.amplitude.null or 0.0}, {**settings, "dated": survey.dated})
+        ranks = np.linspace(MARGIN, 1.0 - MARGIN, N_ONSETS) * (samples.size - 1)
+        yield from (null.first_seen_at(sample) for sample in _at_ranks(samples, ranks))
 
     def refined(self, survey: Survey) -> Iterable[Self]:
         """Yield onsets on both sides, as far as the neighbours on the grid of ``starts``."""
         samples = np.unique(survey.sample_s)
-        own, reach = np.searchsorted(samples, self.values["time"]), samples.size / N_ONSETS
-        for k in _ranks(own - reach, own + reach, N_REFINED, samples.size):
-            yield type(self)(self.where, self._at(samples, k), self.settings)
+        own, reach = float(np.searchsorted(samples, self.values["time"])), samples.size / N_ONSETS
+        ranks = np.clip(np.linspace(own - reach, own + reach, N_REFINED), 1, samples.size - 1)
+        yield from (self.first_seen_at(sample) for sample in _at_ranks(samples, ranks))
 
-    @classmethod
-    def _at(cls, samples_s: FloatArray, k: int) -> dict[str, float]:
-        """Return the values of an effect without amplitude that has set in at sample ``k``, half a ramp before it."""
-        assert cls.amplitude.null is not None
-        return {cls.amplitude.name: cls.amplitude.null, "time": float(samples_s[k]) - 0.5 * _width_s(samples_s)}
+    def first_seen_at(self, sample_s: float) -> Self:
+        """Return the effect that a sample sees in full as the first one: it sets in half a ramp before it."""
+        return self.with_values({"time": float(sample_s) - 0.5 * self.settings["width_s"]})
 
 
-def _ranks(first: float, last: float, count: int, n_samples: int) -> list[int]:
-    """Return up to ``count`` positions of samples, evenly between two of them, the very first left out."""
-    positions = np.rint(np.linspace(first, last, count)).astype(np.int64)
-    return [int(k) for k in np.unique(positions) if 0 < k < n_samples]
-
-
-def _width_s(samples_s: FloatArray) -> float:
-    return float(np.median(np.diff(samples_s)))
-
-
-def _settings(samples_s: FloatArray, dated: bool) -> dict[str, Any]:
-    span = float(samples_s[-1] - samples_s[0])
-    return {"begin_s": float(samples_s[0]), "span_s": span, "width_s": _width_s(samples_s), "dated": dated}
+def _at_ranks(samples_s: FloatArray, ranks: FloatArray) -> FloatArray:
+    """Return the samples next to the given positions in their order, each once."""
+    return np.asarray(samples_s[np.unique(np.rint(ranks).astype(np.int64))])

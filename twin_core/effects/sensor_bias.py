@@ -1,9 +1,7 @@
 """A sensor that reads too much or too little from an instant on: a cracked bond, a new range, a changed reference."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Quality, Where
@@ -38,10 +36,10 @@ class SensorBias(OnsetEffect):
     words = "reads too much or too little from an instant on"
     amplitude = Quality("b_K", "K", null=0.0)
 
-    def qualities(self) -> tuple[Quality, ...]:
-        """Return the bias and its onset, which lies anywhere between the last good sample and the first bad one."""
-        bias, onset = super().qualities()
-        return bias, replace(onset, resolution=self.settings["width_s"] / np.sqrt(12.0))
+    @property
+    def blind_s(self) -> float:
+        """One sampling interval: the onset lies anywhere between the last good sample and the first bad one."""
+        return float(self.settings["width_s"])
 
     def addition(self, layout: Layout) -> Addition:
         """Return the offset of the sensor."""

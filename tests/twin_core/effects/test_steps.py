@@ -8,10 +8,18 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.analytic import SIGMA, laplacian, linear_states, radiative_equilibrium_K
-from tests.helpers import at_named, central_difference, conductive_spec, record_of
+from tests.helpers import (
+    at_named,
+    central_difference,
+    conductive_spec,
+    every_term_network,
+    points,
+    record_of,
+    survey_of,
+)
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
-from twin_core.effects import REGISTRY, Effect
+from twin_core.effects import REGISTRY, Effect, Survey
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
@@ -238,3 +246,57 @@ def test_a_file_without_dates_is_refused_by_a_model_that_knows_a_date(fitted: Ca
     bare = replace(telemetry(19000.0, 20400.0, 0.0), epoch_ns=None, name="bare.csv")
     with pytest.raises(TelemetryError, match=r"bare\.csv: the model knows when its effects set in as dates"):
         forecast(fitted, bare, 3000.0)
+
+
+def switched_off(first: int, last: int) -> Survey:
+    """Return points two minutes apart at which an input is off from one of them to another."""
+    network = every_term_network()
+    along = points(network, 60)
+    power = np.where((np.arange(60) >= first) & (np.arange(60) <= last), 0.0, 40.0)
+    return survey_of(network, replace(along, inputs={**along.inputs, "Q_a": power}))
+
+
+@pytest.mark.parametrize(
+    ("point", "centre", "blind"),
+    [(20.0, 29.5, 19.0), (30.0, 29.5, 19.0), (38.4, 29.5, 19.0), (39.9, 29.5, 19.0), (45.0, 45.0, 0.0)],
+)
+def test_an_onset_while_the_input_is_off_lies_in_the_middle(point: float, centre: float, blind: float) -> None:
+    """Whoever switches a heater off learns that it died when it is switched on again, and not when in between."""
+    survey = switched_off(20, 39)
+    start = next(iter(REGISTRY["input_step"].starts({"channel": "Q_a"}, survey)))
+    found = start.with_values({"f": 0.0, "time": 120.0 * point}).centred(survey)
+    assert found.values == {"f": 0.0, "time": pytest.approx(120.0 * centre)}
+    onset = found.qualities()[1]
+    assert onset.resolution == pytest.approx(120.0 * blind / 12.0**0.5)
+    assert onset.spread(3.0) == pytest.approx(np.hypot(3.0, onset.resolution))
+    if blind:
+        assert onset.spread(60 * 120.0) == onset.resolution  # a fit that tells nothing gives its prior back
+
+
+def test_onsets_are_looked_for_all_over_the_record_but_not_in_its_gaps() -> None:
+    network = every_term_network()
+    survey = survey_of(network, points(network, 400))
+    seen = np.concatenate([survey.sample_s[:100], survey.sample_s[300:]])
+    times = [
+        e.values["time"] for e in REGISTRY["sensor_bias"].starts({"sensor": "T_a"}, replace(survey, sample_s=seen))
+    ]
+    gap = (survey.sample_s[99], survey.sample_s[300] - 120.0)
+    assert len(times) > 20 and times == sorted(times)
+    assert not any(gap[0] < t < gap[1] for t in times)
+    assert times[0] < 0.05 * survey.sample_s[-1] and times[-1] > 0.95 * survey.sample_s[-1]
+    assert np.diff([t for t in times if t < gap[0]]).max() < 0.05 * survey.sample_s[-1]
+
+
+def test_finer_onsets_lie_between_the_neighbours() -> None:
+    network = every_term_network()
+    survey = survey_of(network, points(network, 1000))
+    coarse = list(REGISTRY["sensor_bias"].starts({"sensor": "T_a"}, survey))
+    moved = coarse[7].with_values({"b_K": -0.4})
+    finer = list(moved.refined(survey))
+    times = np.array([effect.values["time"] for effect in finer])
+    assert times.size > 20 and np.diff(times).max() < 0.1 * (times[-1] - times[0])
+    assert coarse[6].values["time"] >= times[0] > coarse[5].values["time"]
+    assert coarse[8].values["time"] <= times[-1] < coarse[9].values["time"]
+    assert all(effect.values["b_K"] == -0.4 and effect.settings == moved.settings for effect in finer)
+    for end in (coarse[0], coarse[-1]):
+        assert all(0.0 < effect.values["time"] < survey.sample_s[-1] for effect in end.refined(survey))
