@@ -15,9 +15,10 @@ import pandas as pd
 from twin_core._typing import FloatArray
 from twin_core.gp.kernels import Matern, Values
 from twin_core.gp.polynomial import ForcePolynomial
-from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, fit_map
+from twin_core.latent_force.hyperparameters import MapFit, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
+from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.regression import LearnedHeatFlow, learn_heat_flow
 from twin_core.latent_force.smooth import smooth_force
 

@@ -21,10 +21,11 @@ from twin_core.gp.kernels import Kernel, Matern, Values
 from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.gp.smoother import smooth
 from twin_core.gp.state_space import LinearModel
-from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, Posterior, fit_map
+from twin_core.latent_force.hyperparameters import MapFit, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.polynomial import regress_pointwise
+from twin_core.latent_force.posterior import GammaPrior, Posterior
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_force
 

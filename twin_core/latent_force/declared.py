@@ -14,10 +14,11 @@ from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
 from twin_core.gp.checked import numbers
 from twin_core.gp.kernels import Kernel, Values
-from twin_core.latent_force.hyperparameters import GammaPrior, MapFit, fit_map
+from twin_core.latent_force.hyperparameters import MapFit, fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
+from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.smooth import LatentForce, smooth_force
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing

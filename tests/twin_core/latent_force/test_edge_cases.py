@@ -6,9 +6,10 @@ from scipy.linalg import expm
 
 from twin_core.errors import ModelError
 from twin_core.gp.kernels import Matern
-from twin_core.latent_force.hyperparameters import GammaPrior, fit_map
+from twin_core.latent_force.hyperparameters import fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
+from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import smooth_extended, smooth_force
 

@@ -7,9 +7,10 @@ from scipy.stats import gamma
 
 from twin_core.errors import ModelError
 from twin_core.gp.kernels import Matern
-from twin_core.latent_force.hyperparameters import GammaPrior, Posterior, fit_map
+from twin_core.latent_force.hyperparameters import fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
+from twin_core.latent_force.posterior import GammaPrior, Posterior
 from twin_core.latent_force.smooth import smooth_force
 
 TIMES = np.arange(0.0, 400.0, 4.0)

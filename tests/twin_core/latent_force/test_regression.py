@@ -8,7 +8,7 @@ from twin_core.errors import ModelError
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.kernels import Matern
 from twin_core.gp.state_space import LinearModel
-from twin_core.latent_force import regression
+from twin_core.latent_force import evidence, regression
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.regression import learn_heat_flow
@@ -152,7 +152,7 @@ def test_many_forces_are_searched_one_after_the_other(monkeypatch):
     model, y = _model(), _samples(4)
     smoothed = smooth_force(model, y, VALUES)
     full = learn_heat_flow(model, y, VALUES, smoothed)
-    monkeypatch.setattr(regression, "EXHAUSTIVE", 1)
+    monkeypatch.setattr(evidence, "EXHAUSTIVE", 1)
     assert learn_heat_flow(model, y, VALUES, smoothed).degrees == full.degrees
 
 
