@@ -127,7 +127,7 @@ def test_forecast_from_the_state(client: AppClient) -> None:
     assert found["time"] == [f"1970-01-01T00:0{m}:{s}Z" for m, s in ((2, "00"), (2, "20"), (2, "40"))]
     assert found["values"]["T_px"] == {"mean": [7, 7, 7], "q05": [6.55] * 3, "q50": [7] * 3, "q95": [7.45] * 3}
     assert (found["model_version"], found["from"]) == (1, "1970-01-01T00:01:40Z")
-    assert found["units"] == {"T_px": "K", "T_tank": "degC"}
+    assert found["units"] == {"T_px": "K", "T_tank": "degC"} and found["notices"] == ["held the last readings"]
     plan = {"time": [110, "1970-01-01T00:02:00Z"], "values": {"Q_px": [1.0, 5.0]}}
     body = {"horizon_s": 60, "step_s": 60, "plan": plan, "quantiles": [0.975]}
     planned = client.post(f"{TWIN}/forecasts", json=body).json()

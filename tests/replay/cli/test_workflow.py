@@ -68,6 +68,31 @@ def test_forecast_follows_its_plan(desk: Path, capsys: pytest.CaptureFixture[str
     assert 8.0 < ends[200] - ends[0] < 10.9
 
 
+def test_a_forecast_says_where_a_learned_heat_is_not_at_home(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A model file whose heat was learned some kelvin away: the note goes to stderr and into the document."""
+    model, data, out = desk / "model.json", desk / "data.csv", desk / "beyond.json"
+    run(capsys, "calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
+    document = json.loads(model.read_text())
+    settings = {"degree": 0, "vanishing": False, "low_K": [100.0], "high_K": [110.0], "misfit_W": 0.0}
+    heat = {
+        "effect": "learned_heat_flow",
+        "where": {"node": "a"},
+        "settings": settings | {"covariance_W2": []},
+        "values": {"coefficients[0]": 0.5},
+    }
+    value = {"learned_heat_flow(a).coefficients[0]": 0.5}
+    document |= {"effects": [heat], "values": document["values"] | value, "free_names": [], "covariance": []}
+    model.write_text(json.dumps(document))
+    asked = ["forecast", "--model", model, "--telemetry", data, "--horizon", "600", "--out", out, "--json"]
+    assert main([*map(str, asked)]) == 0
+    printed = capsys.readouterr()
+    (notice,) = json.loads(printed.out)["notices"]
+    assert notice.startswith(
+        "learned_heat_flow(a): learned at a 100.00 to 110.00 K; 100% of the prediction lies outside"
+    )
+    assert notice in printed.err
+
+
 def test_close_loop_leaves_its_three_files(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = desk / "loop"
     arguments = ["close-loop", "--spec", desk / "spec.yaml", "--telemetry", desk / "data.csv", "--out", out]
