@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.network_world import SIGMA, SPACE_K, Heat, Hidden, World
+from benchmarks.network_world import SIGMA, SPACE_K, Heat, Hidden, Switch, World
 
 
 def _into(world: World, node: int, q: Callable[[float, int, float], float]) -> Heat:
@@ -121,6 +121,34 @@ def nonlinear_convection(world: World, node: int) -> Hidden:
         return k0 * float(np.sign(d) * abs(d) ** p)
 
     return Hidden({"node": f"n{node}", "boundary": "room"}, _into(world, node, q))
+
+
+def periodic_heat_load(world: World, node: int) -> Hidden:
+    """Return a heat with a period of its own, between a fifth of an orbit and three orbits."""
+    size = world.mean_load_W * world.rng.uniform(0.2, 0.6)
+    q0, phase = size * float(world.rng.uniform(-0.5, 0.5)), float(world.rng.uniform(0.0, 2.0 * np.pi))
+    period_s = world.period_s * float(np.exp(world.rng.uniform(np.log(0.2), np.log(3.0))))
+    heat = _into(world, node, lambda t, k, x: q0 + size * float(np.sin(2.0 * np.pi * t / period_s + phase)))
+    return Hidden({"node": f"n{node}"}, heat)
+
+
+def thermostat_heater(world: World, node: int) -> Hidden:
+    """Return a heater with hysteresis about the colder half of the healthy temperatures."""
+    healthy = world.simulate()[:, node]
+    low, high = np.quantile(healthy, (0.02, 0.98))
+    on_K = float(np.quantile(healthy, world.rng.uniform(0.15, 0.5)))
+    off_K = on_K + max(0.5, float(world.rng.uniform(0.1, 0.3)) * (high - low))
+    power = world.mean_load_W * float(world.rng.uniform(0.4, 0.9))
+    relay = {"on": False}
+
+    def flip() -> None:
+        relay["on"] = not relay["on"]
+
+    def crossing(x: np.ndarray) -> float:
+        return float(off_K - x[node] if relay["on"] else x[node] - on_K)
+
+    heat = _into(world, node, lambda t, k, x: power * relay["on"])
+    return Hidden({"node": f"n{node}"}, heat, switch=Switch(crossing, flip))
 
 
 def capacity_temperature(world: World, node: int) -> Hidden:
@@ -243,6 +271,8 @@ HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
         hidden_mass,
         radiative_exchange,
         nonlinear_convection,
+        periodic_heat_load,
+        thermostat_heater,
         capacity_temperature,
         latent_heat,
         input_step,

@@ -154,7 +154,10 @@ def survey_of(network: Network, along: Along, channel_levels: dict[str, tuple[fl
     capacity = network.parameters.values[network.capacity_index]
     named = network.parameters.as_dict()
     edges = (0, along.time_s.size)
-    return Survey(network.layout, along, balance.rate_K_per_s, capacity, levels, edges, named, along.time_s)
+    residual = np.random.default_rng(0).normal(size=(along.time_s.size, len(network.spec.sensors)))
+    return Survey(
+        network.layout, along, balance.rate_K_per_s, capacity, levels, edges, named, along.time_s, False, residual
+    )
 
 
 def null_effects(kind: type[Effect]) -> list[Effect]:

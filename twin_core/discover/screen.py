@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.calibrate.latent_heat import HeatFit, parameter_columns, whiten
+from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
@@ -76,7 +76,18 @@ def survey_of(fit: HeatFit) -> Survey:
         fit.network.parameters.as_dict(),
         np.concatenate([r.clock_s[n.segment.valid.any(axis=1)] for r, n in zip(records, fit.nominals, strict=True)]),
         records[0].epoch_ns is not None,
+        np.concatenate([_residual_at_points(nominal) for nominal in fit.nominals]),
     )
+
+
+def _residual_at_points(nominal: Nominal) -> FloatArray:
+    """Return measured minus modelled at the stage points of a segment, (n_points, n_sensors); zero if nothing was read."""
+    segment, columns = nominal.segment, []
+    for valid, residual in zip(segment.valid.T, nominal.residual_K.T, strict=True):
+        time_s, seen = segment.record.time_s[valid], residual[valid]
+        points_s = segment.forcing.stage_time_s.ravel()
+        columns.append(np.interp(points_s, time_s, seen) if seen.size else np.zeros(points_s.size))
+    return np.stack(columns, axis=1)
 
 
 def _joined(parts: Sequence[Along]) -> Along:

@@ -20,12 +20,14 @@ from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.effects.missing_conductor import MissingConductor
 from twin_core.effects.nonlinear_convection import NonlinearConvection
+from twin_core.effects.periodic_heat_load import PeriodicHeatLoad
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
 from twin_core.effects.radiative_exchange import RadiativeExchange
 from twin_core.effects.sensor_bias import SensorBias
 from twin_core.effects.sensor_drift import SensorDrift
 from twin_core.effects.sensor_lag import SensorLag
+from twin_core.effects.thermostat_heater import ThermostatHeater
 from twin_core.errors import ModelError, SpecError
 
 REGISTRY: dict[str, type[Effect]] = {
@@ -37,7 +39,9 @@ REGISTRY: dict[str, type[Effect]] = {
         LeakToBoundary,
         NonlinearConvection,
         ConstantHeatLoad,
+        PeriodicHeatLoad,
         ChannelHeatLoad,
+        ThermostatHeater,
         ProportionalHeater,
         InputGain,
         InputPowerLaw,

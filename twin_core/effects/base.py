@@ -107,6 +107,8 @@ class Survey:
         When something was read, on the clock of ``along``.
     dated
         Whether that clock shows dates or a file's own seconds.
+    residual_K : (n_points, n_sensors)
+        Measured minus modelled, interpolated where nothing was read.
     """
 
     layout: Layout
@@ -118,6 +120,7 @@ class Survey:
     parameters: Mapping[str, float] = field(default_factory=dict)
     sample_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     dated: bool = False
+    residual_K: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def temperature_K(self, node: str) -> FloatArray:
         """Return a node's temperature along the record, (n_points,)."""

@@ -20,6 +20,7 @@ STRETCH = 1024
 """Steps solved together at first: long enough to vectorise well, short enough for Newton to converge from a constant."""
 
 TOLERANCE_K = 1e-7
+N_NEWTON = 25
 LIMIT_K = (0.5, 5.0e3)
 """Temperatures that Newton's iterates may visit; a solution at a limit is not a solution."""
 
@@ -98,7 +99,7 @@ def _newton(
     n_steps, n_nodes = last - first, start_K.size
     stages = np.clip(guess, *LIMIT_K)
     change_before = np.inf
-    for iteration in range(25):
+    for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
         balance = balance_along(network, values, forcing, stages, first, last)
         jacobian = balance.jacobian_per_s.reshape(n_steps, 2, n_nodes, n_nodes)
         constant = balance.rate_K_per_s.reshape(n_steps, 2, n_nodes) - np.einsum("ksij,ksj->ksi", jacobian, stages)
@@ -106,7 +107,9 @@ def _newton(
         if not np.isfinite(solved).all():
             return None
         change = float(np.abs(solved - stages).max())
-        stages = np.clip(solved, *LIMIT_K)
+        # A step across a kink may swing from one side to the other: half the way ends that.
+        swings = n_steps == 1 and iteration > 8 and change >= TOLERANCE_K
+        stages = np.clip(0.5 * (solved + stages) if swings else solved, *LIMIT_K)
         if change < TOLERANCE_K:
             inside = (solved >= LIMIT_K[0]).all() and (solved <= LIMIT_K[1]).all()
             return solved if inside else None

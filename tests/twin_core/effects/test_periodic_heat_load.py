@@ -1,0 +1,43 @@
+"""A periodic heat: by hand, and the periods from which a search for it starts."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.helpers import every_term_network, points, survey_of
+from twin_core.effects import REGISTRY
+
+LOAD = REGISTRY["periodic_heat_load"]
+SETTINGS = {"origin_s": 600.0, "dated": False}
+
+
+def test_its_heat_by_hand() -> None:
+    effect = LOAD({"node": "b"}, {"Q_W": 2.0, "A_W": 3.0, "B_W": -1.0, "P_s": 480.0}, SETTINGS)
+    network = every_term_network([effect])
+    (term,) = effect.addition(network.layout).terms
+    heat = term.evaluate(points(network, 10), np.array([2.0, 3.0, -1.0, 480.0])).heat_W[:, 0]
+    np.testing.assert_allclose(heat[5:10], [1.0, 5.0, 3.0, -1.0, 1.0], atol=1e-12)  # a quarter of a period each
+
+
+@pytest.mark.parametrize("node", ["a", "c"])
+@pytest.mark.parametrize("period_s", [1111.0, 7000.0])
+def test_a_line_in_the_residual_is_a_period_to_start_from(node: str, period_s: float) -> None:
+    """In noise and a drift ten times as large, to a fraction of what the record's length resolves."""
+    network = every_term_network()
+    along = points(network, 800)
+    t, rng = along.time_s, np.random.default_rng(3)
+    drift = 10.0 * np.cumsum(rng.normal(0.0, 1.0, (800, 2)), axis=0) / np.sqrt(800.0)
+    line = 2.0 * np.sin(2.0 * np.pi * t / period_s + 1.0)[:, None]
+    survey = replace(survey_of(network, along), residual_K=drift + line + rng.normal(0.0, 0.3, (800, 2)))
+    starts = list(LOAD.starts({"node": node}, survey))
+    assert 6 <= len(starts) <= 12
+    nearest = min(abs(1.0 / e.values["P_s"] - 1.0 / period_s) for e in starts)
+    assert nearest < 0.25 / (t[-1] - t[0])
+    assert all(e.values["P_s"] <= t[-1] - t[0] + 1e-6 for e in starts)
+
+
+def test_a_residual_without_anything_gives_no_line() -> None:
+    network = every_term_network()
+    survey = survey_of(network, points(network, 100))
+    assert not list(LOAD.starts({"node": "a"}, replace(survey, residual_K=np.zeros((100, 2)))))

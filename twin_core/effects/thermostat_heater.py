@@ -1,0 +1,216 @@
+"""An undeclared thermostat: a survival heater with hysteresis that nobody wrote into the declaration."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Self
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.network.model import Addition, ExtraNode, Layout
+from twin_core.network.terms import Along, Entry, Heat
+from twin_core.parameters.parameter import Parameter, positive
+
+ON_QUANTILES = (0.005, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
+OFF_QUANTILES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95)
+"""Temperatures dwell at the lower threshold of a heater that keeps them from falling, so it is looked for more finely."""
+LEAST_BAND_K = 0.3
+LEAST_WIDTH_K, WIDTH_QUANTILE = 0.02, 0.8
+"""The first point beyond a threshold has switched in part: all the way at the distance that a node moves between two
+points at most times, so that the instant of switching is felt between the points."""
+
+DELAY_SHARE = 0.002
+"""Time constant of the memory over the sampling interval: it has settled a step after each switching."""
+
+
+@dataclass(frozen=True)
+class Switching:
+    """What a thermostat does along a temperature, (n_points,) each.
+
+    Attributes
+    ----------
+    share
+        Share of full power over the interval that ends at the point.
+    by_memory
+        Its slope with the share that is remembered at the same point.
+    by_on, by_off
+        Its slope with either threshold, in 1/K: a switching instant moves along the temperature. The slope with the
+        temperature itself is minus their sum.
+    called
+        On (1), off (-1), or none of them known (0) after the point.
+    """
+
+    share: FloatArray
+    by_memory: FloatArray
+    by_on: FloatArray
+    by_off: FloatArray
+    called: IntArray
+
+
+def switching(
+    temperature_K: FloatArray, on_K: float, off_K: float, width_K: float, remembered: FloatArray
+) -> Switching:
+    """Return how a thermostat switches along a temperature.
+
+    Parameters
+    ----------
+    temperature_K : (n_points,)
+    on_K, off_K
+        Thresholds.
+    width_K
+        Distance beyond a threshold at which the first point there counts as wholly switched.
+    remembered : (n_points,)
+        Share of full power that the memory stands for; its first is in force until a threshold is passed.
+    """
+    beyond = np.where(temperature_K < on_K, 1, np.where(temperature_K > off_K, -1, 0))
+    latest = np.maximum.accumulate(np.where(beyond != 0, np.arange(beyond.size), -1))
+    called = np.where(latest >= 0, beyond[latest], 0)
+    before = np.concatenate([[0], called[:-1]])
+    known = before != 0
+    old = np.where(known, before == 1, remembered[0])
+    distance = np.where(called == 1, on_K - temperature_K, temperature_K - off_K)
+    switched = np.where(called != before, np.clip(distance / width_K, 0.0, 1.0), 1.0)
+    switched = np.where(called == 0, 0.0, switched)
+    new = (called == 1).astype(np.float64)
+    moving = (called != before) & (switched < 1.0) & (switched > 0.0)
+    slope = np.where(moving, (new - old) / width_K, 0.0)
+    return Switching(
+        old + (new - old) * switched,
+        np.where((called == 0) | (np.arange(called.size) == 0), 1.0 - switched, 0.0),
+        np.where(called == 1, slope, 0.0),
+        np.where(called == -1, -slope, 0.0),
+        called,
+    )
+
+
+@dataclass(frozen=True)
+class Memory:
+    """The state of the network that remembers a relay wherever a record is cut, as a temperature.
+
+    Attributes
+    ----------
+    off_K, on_K
+        What stands for off and on. These are thresholds that a search started from: a memory that begins at its node's
+        temperature says off where that has just fallen to the lower, on where it has risen to the upper.
+    delay_s
+        Time constant with which it follows the relay.
+    """
+
+    off_K: float
+    on_K: float
+    delay_s: float
+
+    def share(self, state_K: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the share of full power that a state stands for, and its slope in 1/K."""
+        share = (state_K - self.off_K) / (self.on_K - self.off_K)
+        return np.clip(share, 0.0, 1.0), np.where((share > 0.0) & (share < 1.0), 1.0 / (self.on_K - self.off_K), 0.0)
+
+    def rate_K_per_s(self, state_K: FloatArray, called: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return how fast it follows, and the slope of that in 1/s; the first point is what it remembers."""
+        follows = (called != 0) & (np.arange(called.size) > 0)
+        target = np.where(called == 1, self.on_K, self.off_K)
+        return (
+            np.where(follows, (target - state_K) / self.delay_s, 0.0),
+            np.where(follows, -1.0 / self.delay_s, 0.0),
+        )
+
+
+@dataclass(frozen=True)
+class ThermostatHeat:
+    """q = Q, on below T_on, off above T_off; values are Q, T_on, T_off.
+
+    Until a threshold is passed, the memory tells; from then on, the temperatures.
+    """
+
+    node: int
+    state: int
+    width_K: float
+    memory: Memory
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate heater and memory, which has unit capacity, so that its heat is its rate."""
+        power, on_K, off_K = values
+        state = along.temperatures_K[:, self.state]
+        remembered, slope = self.memory.share(state)
+        relay = switching(along.temperatures_K[:, self.node], on_K, off_K, self.width_K, remembered)
+        rate, decay = self.memory.rate_K_per_s(state, relay.called)
+        by_node, by_state = -power * (relay.by_on + relay.by_off), power * relay.by_memory * slope
+        jacobian = np.stack([np.stack([by_node, by_state], -1), np.stack([np.zeros_like(decay), decay], -1)], axis=-2)
+        return Heat(
+            (self.node, self.state),
+            np.stack([power * relay.share, rate], axis=1),
+            jacobian,
+            [
+                Entry(0, self.node, relay.share),
+                Entry(1, self.node, power * relay.by_on),
+                Entry(2, self.node, power * relay.by_off),
+            ],
+        )
+
+
+class ThermostatHeater(Effect):
+    """q = Q, on below T_on, off above T_off."""
+
+    name = "thermostat_heater"
+    keys = ("node",)
+    equation = "q = Q from T < T_on until T > T_off, else 0"
+    reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
+    words = "is heated by a thermostat"
+
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return power and both thresholds."""
+        return (
+            Quality("Q_W", "W", null=0.0, positive=True),
+            Quality("T_on_K", "K", prior_std=10.0),
+            Quality("T_off_K", "K", prior_std=10.0),
+        )
+
+    @property
+    def _state(self) -> str:
+        return f"{self.where['node']}.thermostat"
+
+    def extra_nodes(self, layout: Layout) -> tuple[ExtraNode, ...]:
+        """Return the memory as a state of unit capacity."""
+        unit = positive(f"C:{self._state}", "J/K", 1.0, frozen=True)
+        return (ExtraNode(self._state, unit, self.where["node"]),)
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return heater and memory."""
+        node, state = layout.node(self.where["node"]), layout.node(self._state)
+        memory = Memory(*(float(self.settings[key]) for key in ("off_state_K", "on_state_K", "delay_s")))
+        return Addition((ThermostatHeat(node, state, float(self.settings["width_K"]), memory, self.parameters()),))
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every node."""
+        yield from ({"node": node} for node in layout.declared_nodes)
+
+    @classmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield pairs of thresholds among the quantiles of the visited temperatures."""
+        temperature = survey.temperature_K(where["node"])
+        lows, highs = np.quantile(temperature, ON_QUANTILES), np.quantile(temperature, OFF_QUANTILES)
+        width = max(LEAST_WIDTH_K, float(np.quantile(np.abs(np.diff(temperature)), WIDTH_QUANTILE)))
+        steps = np.diff(survey.along.time_s)
+        delay = DELAY_SHARE * 2.0 * float(np.median(steps[steps > 0]))
+        for low, high in product(lows.tolist(), highs.tolist()):
+            if high - low > LEAST_BAND_K:
+                settings = {"off_state_K": low, "on_state_K": high, "width_K": width, "delay_s": delay}
+                yield cls(where, {"Q_W": 0.0, "T_on_K": low, "T_off_K": high}, settings)
+
+    def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
+        """Return the share of full power along the survey, from the crossings of the thresholds."""
+        alone = replace(survey.layout, nodes=(*survey.layout.nodes, self._state))
+        (term,) = self.addition(alone).terms
+        values = np.array([1.0, self.values["T_on_K"], self.values["T_off_K"]])
+        share = np.zeros(survey.along.time_s.size)
+        for s in survey.segments():
+            temperatures = survey.along.temperatures_K[s]
+            start = np.full((temperatures.shape[0], 1), temperatures[0, survey.layout.node(self.where["node"])])
+            along = replace(survey.along, temperatures_K=np.hstack([temperatures, start]))
+            share[s] = term.evaluate(along, values).heat_W[:, 0]
+        return [[(survey.layout.node(self.where["node"]), share)]]
