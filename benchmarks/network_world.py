@@ -144,10 +144,12 @@ def _advance(rates: Any, start: float, stop: float, state: np.ndarray, k: int, s
         return switch.crossing(x)
 
     crossing.terminal, crossing.direction = True, -1.0  # type: ignore[attr-defined]
+    events = None if switch is None else crossing
+    if switch is not None and switch.crossing(state) <= 0.0:
+        switch.flip()
     while start < stop:
-        if switch is not None and switch.crossing(state) <= 0.0:
-            switch.flip()
-        events = None if switch is None else crossing
         out = solve_ivp(rates, (start, stop), state, args=(k,), method="RK45", rtol=1e-7, atol=1e-6, events=events)
         start, state = float(out.t[-1]), out.y[:, -1]
+        if switch is not None and out.status == 1:
+            switch.flip()
     return state
