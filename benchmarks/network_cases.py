@@ -1,12 +1,13 @@
 """Seeded spacecraft networks with an undeclared effect, simulated by SciPy: truth that our own solver has no part in."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_world import NOTHING, SPACE_K, World
+from benchmarks.outside_vocabulary import OUTSIDE
 from twin_core.network.spec import TwinSpec, load_spec
 from twin_core.telemetry import Record
 
@@ -21,7 +22,7 @@ class Case:
     where: dict[str, Any]
     truth_K: np.ndarray
     onset_s: float | None = None
-    onset_s: float | None = None
+    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: float = 60.0) -> Case:
@@ -29,7 +30,7 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
     rng = np.random.default_rng(seed)
     world = World(rng, n_orbits, dt_s)
     node = int(rng.integers(0, world.n))
-    hidden = NOTHING if effect is None else HIDDEN[effect](world, node)
+    hidden = NOTHING if effect is None else (HIDDEN | OUTSIDE)[effect](world, node)
     truth = world.simulate(hidden)[:, : world.n]
     read = truth if hidden.offset_K is None else truth + hidden.offset_K
     noise = float(rng.uniform(0.05, 0.15))
@@ -73,4 +74,5 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
             "loads": loads,
         }
     )
-    return Case(spec, Record(world.time_s, values, None, f"case-{seed}"), effect, hidden.where, truth, hidden.onset_s)
+    record = Record(world.time_s, values, None, f"case-{seed}")
+    return Case(spec, record, effect, hidden.where, truth, hidden.onset_s, hidden.parameters)

@@ -1,7 +1,7 @@
 """A random spacecraft as a network, integrated by SciPy: truth that our own solver has no part in."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ class Hidden:
         What the sensors read beyond the truth.
     onset_s
         When it sets in; None where it is there from the start.
+    parameters
+        Its size, by the report's names.
     """
 
     where: dict[str, Any]
@@ -46,6 +48,7 @@ class Hidden:
     switch: "Switch | None" = None
     offset_K: np.ndarray | None = None
     onset_s: float | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,63 @@
+"""The suite of the closed loop: which spacecraft hide what. Every case is drawn from its seed and nothing else."""
+
+from dataclasses import dataclass
+
+from benchmarks.fem_cases import FEM_EFFECTS, fem_case
+from benchmarks.hidden_effects import HIDDEN
+from benchmarks.network_cases import Case, network_case
+from benchmarks.outside_vocabulary import OUTSIDE
+
+N_NETWORKS = 5
+N_FEM = 1
+N_CLEAN = 300
+N_OUTSIDE = 2
+FIRST_SEED = 1000
+"""Seeds from here on belong to the suite; the tests use smaller ones."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One case by name.
+
+    Attributes
+    ----------
+    group
+        "network", "fem", "clean" or "outside".
+    effect
+        What is hidden; None in clean cases.
+    seed
+        Draws everything else.
+    """
+
+    group: str
+    effect: str | None
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the suite."""
+        return f"{self.group}:{self.effect or 'nothing'}:{self.seed}"
+
+    def build(self) -> Case:
+        """Simulate the case. Clean records vary in length and sampling as those with effects do."""
+        if self.group == "fem":
+            return fem_case(self.effect, self.seed)
+        if self.group == "clean" and self.seed % 10 == 0:
+            return fem_case(None, self.seed)
+        n_orbits, dt_s = ((12, 60.0), (8, 60.0), (12, 30.0), (6, 45.0))[self.seed % 4]
+        return network_case(self.effect, self.seed, n_orbits=n_orbits, dt_s=dt_s)
+
+
+def suite(groups: tuple[str, ...] = ("network", "fem", "clean", "outside")) -> list[Task]:
+    """Return the tasks of the suite's groups."""
+    every = {
+        "network": [
+            Task("network", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(N_NETWORKS)
+        ],
+        "fem": [Task("fem", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(FEM_EFFECTS) for k in range(N_FEM)],
+        "clean": [Task("clean", None, FIRST_SEED + k) for k in range(N_CLEAN)],
+        "outside": [
+            Task("outside", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(OUTSIDE) for k in range(N_OUTSIDE)
+        ],
+    }
+    return [task for group in groups for task in every[group]]

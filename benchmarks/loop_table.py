@@ -1,0 +1,116 @@
+"""Tables of the closed loop over the suite: per effect, per group, and the targets with what was measured."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.markdown import markdown_table, save_table
+
+Row = dict[str, Any]
+Z90 = 1.6448536269514722
+
+
+def save_tables(rows: Sequence[Row]) -> None:
+    """Save ``benchmarks/tables/loop.md`` from the rows of a run."""
+    failed = [row for row in rows if "error" in row]
+    good = [row for row in rows if "error" not in row]
+    parts = ["## Targets", targets(good), "## By effect", by_effect(good), "## Worst cases", worst(good)]
+    note = "".join(f"\nFailed: {row['task']}: {row['error']}" for row in failed)
+    save_table("loop", "Closed loop over seeded spacecraft", "\n\n".join(parts), "benchmarks.loop", note)
+
+
+def _share(rows: Sequence[Row], test: Callable[[Row], bool]) -> str:
+    n = sum(bool(test(row)) for row in rows)
+    return f"{100 * n / len(rows):.1f} % ({n}/{len(rows)})" if rows else "none run"
+
+
+def _median(values: Sequence[float], form: str = "{:.2f}") -> str:
+    finite = [v for v in values if v is not None and np.isfinite(v)]
+    return form.format(float(np.median(finite))) if finite else "none run"
+
+
+def targets(rows: Sequence[Row]) -> str:
+    """Return the table of what was to be reached."""
+    groups = {name: [r for r in rows if r["group"] == name] for name in ("network", "fem", "clean", "outside")}
+    named = [*groups["network"], *groups["fem"]]
+    onsets, bands = [r["onset_error"] for r in named if r["onset_error"] is not None], [c for r in named for c in in_band(r)]
+    ratios = [r["after_K"] / r["known_K"] for r in named if r["known_K"]]
+    table = [
+        ["right effect and place first, network truth", ">= 95 %", _share(groups["network"], lambda r: r["first"])],
+        ["right effect and place first, finite elements", ">= 80 %", _share(groups["fem"], lambda r: r["first"])],
+        ["within the stated alternatives, network truth", ">= 99 %", _share(groups["network"], lambda r: r["listed"])],
+        ["within the stated alternatives, finite elements", ">= 92 %", _share(groups["fem"], lambda r: r["listed"])],
+        ["findings on clean records", "<= 1 %", _share(groups["clean"], lambda r: bool(r["findings"]))],
+        ["a wrong name outside the vocabulary", "", _share(groups["outside"], has_wrong_name)],
+        ["held-out error over that with the effect known, median", "<= 1.1", _median(ratios)],
+        ["held-out error worse than before", "0", _share(rows, lambda r: r["after_K"] > 1.001 * r["before_K"])],
+        ["onset within 2 % of the record", "", _share(onsets, lambda e: e <= 0.02)],  # type: ignore[arg-type]
+        ["90 % bands that hold the true parameter", "85 to 95 %", _share(bands, bool)],  # type: ignore[arg-type]
+        ["seconds per case, median", "<= 10", _median([r["seconds"] for r in rows], "{:.1f}")],
+    ]
+    return markdown_table(["measure", "to reach", "measured"], table)
+
+
+def has_wrong_name(row: Row) -> bool:
+    """Return whether an effect of the vocabulary was named: a learned heat flow names nothing."""
+    return any(f["effect"] != "learned_heat_flow" for f in row["findings"])
+
+
+def in_band(row: Row) -> list[bool]:
+    """Return for every true parameter of a found effect whether its 90 % band holds it; settings have no band."""
+    held = []
+    for name, true in row["truth"].items():
+        found = (row["own"] or {}).get(name)
+        if name == "time" or not isinstance(true, float) or found is None or not isinstance(found["std"], float):
+            continue
+        held.append(abs(found["mean"] - true) <= Z90 * found["std"])
+    return held
+
+
+def by_effect(rows: Sequence[Row]) -> str:
+    """Return one line per group and effect."""
+    keys = dict.fromkeys((row["group"], row["effect"]) for row in rows)
+    table = []
+    for group, effect in keys:
+        own = [row for row in rows if (row["group"], row["effect"]) == (group, effect)]
+        table.append(
+            [
+                group,
+                effect or "nothing",
+                str(len(own)),
+                str(sum(r["first"] for r in own)),
+                str(sum(r["listed"] for r in own)),
+                str(sum(bool(r["findings"]) for r in own)),
+                _median([r["before_K"] for r in own], "{:.3f}"),
+                _median([r["after_K"] for r in own], "{:.3f}"),
+                _median([r["known_K"] for r in own if r["known_K"] is not None], "{:.3f}"),
+                _median([r["seconds"] for r in own], "{:.1f}"),
+            ]
+        )
+    header = [
+        "truth",
+        "hidden",
+        "cases",
+        "first",
+        "listed",
+        "any finding",
+        "before, K",
+        "after, K",
+        "effect known, K",
+        "s",
+    ]
+    return markdown_table(header, table)
+
+
+def worst(rows: Sequence[Row], n: int = 10) -> str:
+    """Return the cases that were missed, worst held-out error first, with what was said instead."""
+    missed = [r for r in rows if (r["effect"] and r["group"] in ("network", "fem") and not r["listed"])]
+    missed += [r for r in rows if r["group"] == "clean" and r["findings"]]
+    missed.sort(key=lambda r: -r["after_K"] / (r["known_K"] or r["noise_K"]))
+    table = []
+    for r in missed[:n]:
+        said = "; ".join(f"{f['effect']} {f['where']}" for f in r["findings"]) or r["verdict"]
+        errors = [f"{r[key] or float('nan'):.3f}" for key in ("before_K", "after_K", "known_K")]
+        table.append([r["task"], str(r["where"]), said, *errors])
+    return markdown_table(["case", "place", "said", "before, K", "after, K", "effect known, K"], table)
