@@ -34,7 +34,10 @@ def targets(rows: Sequence[Row]) -> str:
     """Return the table of what was to be reached."""
     groups = {name: [r for r in rows if r["group"] == name] for name in ("network", "fem", "clean", "outside")}
     named = [*groups["network"], *groups["fem"]]
-    onsets, bands = [r["onset_error"] for r in named if r["onset_error"] is not None], [c for r in named for c in in_band(r)]
+    onsets, bands = (
+        [r["onset_error"] for r in named if r["onset_error"] is not None],
+        [c for r in named for c in in_band(r)],
+    )
     ratios = [r["after_K"] / r["known_K"] for r in named if r["known_K"]]
     table = [
         ["right effect and place first, network truth", ">= 95 %", _share(groups["network"], lambda r: r["first"])],

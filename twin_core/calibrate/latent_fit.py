@@ -187,7 +187,8 @@ def _improve(
         return log_likelihood(problem, size, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
     before = posterior(free, latent, nominals)
-    step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
+    with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
+        step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
     logarithmic = problem.logarithmic
     step *= min(1.0, 1.5 / max(np.abs(step[logarithmic]).max(initial=0.0), 1e-12))
     for _ in range(5):

@@ -25,6 +25,9 @@ N_BLOCKS = 8
 FORWARD_SHARE = 0.35
 BURN_IN_SHARE = 0.1
 
+CONSIDERABLE = 0.1
+"""Nodes whose latent heat moves them less than this share of the most moved one say nothing about an effect."""
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -200,12 +203,17 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
     return Trial(fitted_effects(effects, values), fit, base.max_step_s, (optimum,))
 
 
-def resettled(trial: Trial) -> Trial:
-    """Return a trial that was fitted on trajectories with its parameters fitted in the presence of latent heat too."""
-    calibration = trial.calibration
+def resettled(simple: Trial, rich: Trial) -> Trial:
+    """Return a trial that was fitted on trajectories with its parameters fitted in the presence of latent heat too.
+
+    Started from its own optimum and from the simpler trial's fit: the likelier one counts.
+    """
+    calibration = rich.calibration
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
-    fit = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
-    return replace(trial, fit=fit, near=(calibration.optimum,), simpler=None)
+    own = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
+    near = try_effects(simple, rich.present_effects, n_passes=15).fit
+    fit = max(own, near, key=lambda f: f.log_posterior)
+    return replace(rich, fit=fit, near=(calibration.optimum,), simpler=None)
 
 
 def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:
@@ -265,12 +273,15 @@ class Validation:
         The same for the end of the training record, after a refit to its beginning: does the effect extrapolate?
     removed_share
         Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
+    explained_share
+        Share of the latent heat's variance that the effect makes superfluous, on the node where it does so most.
     """
 
     ratio: float
     blocks_better: float
     forward_ratio: float
     removed_share: float
+    explained_share: float
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
@@ -297,7 +308,25 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     before, after = simple.block_errors, rich.block_errors
     ratio = float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
     forward = float(np.sqrt(rich.forward_error / max(simple.forward_error, 1e-300)))
-    return Validation(ratio, float(np.mean(after < before)), forward, _removed_share(simple, rich))
+    better = float(np.mean(after < before))
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained_share(simple.fit, rich.fit))
+
+
+def explained_share(simple: HeatFit, rich: HeatFit) -> float:
+    """Return the share of the latent heat's variance that a richer model no longer needs.
+
+    Sizes are compared as rates of temperature, on the nodes where the simpler model needs a considerable one.
+    """
+    nodes = simple.network.nodes
+    kept = [rich.network.nodes.index(node) for node in nodes]
+    before, after = _latent_rates_K_per_s(simple), _latent_rates_K_per_s(rich)[kept]
+    matters = before >= CONSIDERABLE * before.max()
+    return 1.0 - float(((after[matters] / before[matters]) ** 2).min()) if before.max() > 0.0 else 0.0
+
+
+def _latent_rates_K_per_s(fit: HeatFit) -> FloatArray:
+    """Return how fast the latent heat alone would move each node, (n_nodes,)."""
+    return np.asarray(fit.latent.std_W / fit.values[fit.network.capacity_index])
 
 
 def _removed_share(simple: Trial, rich: Trial) -> float:

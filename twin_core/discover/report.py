@@ -49,6 +49,7 @@ def evidence_json(judged: Judged) -> Json:
             "blocks_better": judged.validation.blocks_better,
             "forward_ratio": judged.validation.forward_ratio,
             "removed_share": judged.validation.removed_share,
+            "explained_share": judged.validation.explained_share,
         }
     return row
 

@@ -49,6 +49,10 @@ LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
 
+EXPLAINED_SHARE = 0.5
+"""An effect must make half of the latent heat's variance superfluous where it acts, or something else is missing there."""
+
+
 @dataclass(frozen=True)
 class Judged:
     """A set of effects that was tried on top of a simpler model, and what speaks for it."""
@@ -122,6 +126,14 @@ def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int)
     return list(chosen.values())
 
 
+def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
+    """Return effects at the best of their finer settings, where the first ones are too coarse for a local search."""
+    survey = survey_of(fit)
+    finer = [setting for effect in effects for setting in effect.refined(survey)]
+    best = {probe.effect.place: probe.effect for probe in reversed(screen(fit, survey, finer).probes)}
+    return [best.get(effect.place, effect) for effect in effects]
+
+
 def best_of_each_place(probes: Sequence[Probe], n_samples: int) -> list[Probe]:
     """Return the best setting of each effect and place, best first, each amplitude paid for by its Schwarz penalty."""
     penalty = 0.5 * np.log(max(n_samples, 2))
@@ -175,7 +187,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = max(len(ranked) for ranked in rankings)
-    singles = [(effect,) for effect in shortlist(rankings, needed, N_REFITS)]
+    singles = [(effect,) for effect in refined(state.trial.fit, shortlist(rankings, needed, N_REFITS))]
     if _accept(state, _by_heat(state, singles, n_tried), needed):
         return True
     pairs = [] if fallback else _best_pairs(rankings[0], screenings[0], needed)
@@ -183,23 +195,26 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
 
 
 def _extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
-    """Extend by what open-loop residuals say: the second look, where misfit is too large for the first."""
+    """Extend by what open-loop residuals say: the second look, where misfit is too large for the first.
+
+    Long trajectories forgive an effect that merely resembles what is missing, so the innovations must support it too.
+    """
     calibration = state.trial.calibration
     fit = about_trajectory(calibration.problem, calibration.optimum)
     screenings = screened(state.trial, fit, TRAJECTORY_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = max(len(ranked) for ranked in rankings)
-    options = [(effect,) for effect in shortlist(rankings, needed, N_TRAJECTORY_REFITS)]
     judged = []
-    for option in options:
-        trial = try_on_trajectories(state.trial, (*state.trial.present_effects, *option))
+    for effect in refined(fit, shortlist(rankings, needed, N_TRAJECTORY_REFITS)):
+        trial = try_on_trajectories(state.trial, (*state.trial.present_effects, effect))
         if trial is not None:
             found = trial.effects[len(state.trial.effects) :]
             judged.append(Judged(found, weigh_trajectories(state.trial, trial, n_tried), trial))
-    if not _accept(state, judged, needed):
-        return False
-    state.trial = resettled(state.trial)
-    return True
+    likely = [j for j in judged if j.evidence.log_bayes_factor > needed]
+    settled = [replace(j, trial=resettled(state.trial, j.trial)) for j in sorted(likely, key=_worth)[:N_VALIDATED]]
+    supported = [j for j in settled if weigh(state.trial, j.trial, n_tried).log_bayes_factor > needed]
+    state.rejected += [j for j in judged if all(j.effects != s.effects for s in supported)]
+    return _accept(state, supported, needed)
 
 
 def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) -> list[tuple[Effect, ...]]:
@@ -231,11 +246,11 @@ def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int
 
 def _accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     """Keep the best option that passes evidence and validation; False if none does."""
-    judged = once_each(options)
+    judged = simplest_first(once_each(options))
     failed: list[Judged] = []
     for best in judged[:N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
-            break
+            continue
         own = replace(best, validation=validate(state.trial, best.trial))
         if own.validation is not None and is_valid(own.validation):
             close = [j for j in judged if j is not best and j not in failed and _is_close(j, best)]
@@ -256,12 +271,20 @@ def once_each(options: Sequence[Judged]) -> list[Judged]:
     return list(best.values())
 
 
+def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
+    """Return options, best first, with the simplest of those in front that the data hardly tell from the best."""
+    close = [j for j in judged if j is judged[0] or _is_close(j, judged[0])]
+    rest = [j for j in judged if all(j is not c for c in close)]
+    return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
+
+
 def is_valid(validation: Validation) -> bool:
     """Return whether an effect helps where it was not fitted, by an amount that a lumped network can judge."""
     blocks, forward = validation.ratio, validation.forward_ratio
     both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
     either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
-    return (both or either) and validation.removed_share > LUMPING_SHARE
+    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > EXPLAINED_SHARE
+    return (both or either) and matters
 
 
 def _worth(judged: Judged) -> float:

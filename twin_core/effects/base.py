@@ -21,6 +21,9 @@ from twin_core.units import format_instant
 
 Where = dict[str, Any]
 
+LEAST_SHARE = 0.1
+"""A positive parameter that a linear response would push below this share of its null value starts there instead."""
+
 
 @dataclass(frozen=True)
 class Quality:
@@ -73,13 +76,14 @@ class Quality:
     def moved(self, amount: float) -> float | None:
         """Return the value at a distance from null, None if it is not positive but must be.
 
-        Beyond a lower bound it is put on it: the distance is reckoned from a declared size that the missing effect has
+        Beyond a lower bound, or a small share of a positive null, it is put there: the distance is reckoned from a declared size that the missing effect has
         spoilt, so that what vanishes altogether may look like less than nothing.
         """
         assert self.null is not None
         value = self.null + amount
-        if self.positive and not value > 1e-12:
-            return None
+        if self.positive:
+            value = max(value, LEAST_SHARE * self.null)
+            return value if value > 1e-12 else None
         return value if self.lower is None else max(value, self.lower)
 
 
