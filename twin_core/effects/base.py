@@ -76,8 +76,8 @@ class Quality:
     def moved(self, amount: float) -> float | None:
         """Return the value at a distance from null, None if it is not positive but must be.
 
-        Beyond a lower bound, or a small share of a positive null, it is put there: the distance is reckoned from a declared size that the missing effect has
-        spoilt, so that what vanishes altogether may look like less than nothing.
+        Beyond a lower bound, or a small share of a positive null, it is put there: the distance is reckoned from a
+        declared size that the missing effect has spoilt, so that what nearly vanishes may look like less than nothing.
         """
         assert self.null is not None
         value = self.null + amount
