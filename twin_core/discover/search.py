@@ -78,10 +78,11 @@ class Finding:
 
 @dataclass
 class Search:
-    """The state of a search: the model so far and how it came about."""
+    """The state of a search: the model so far and how it came about; ``n_named`` candidates were tried before a fallback."""
 
     trial: Trial
     base: Trial
+    n_named: int = 0
     findings: list[Finding] = field(default_factory=list)
     rejected: list[Judged] = field(default_factory=list)
 
@@ -186,7 +187,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     """Extend by what the innovations say, in the presence of latent heat."""
     screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
-    n_tried = max(len(ranked) for ranked in rankings)
+    n_tried = _n_tried(state, rankings, fallback=fallback)
     singles = [(effect,) for effect in refined(state.trial.fit, shortlist(rankings, needed, N_REFITS))]
     if _accept(state, _by_heat(state, singles, n_tried), needed):
         return True
@@ -197,13 +198,14 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
 def _extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
     """Extend by what open-loop residuals say: the second look, where misfit is too large for the first.
 
-    Long trajectories forgive an effect that merely resembles what is missing, so the innovations must support it too.
+    Long trajectories forgive an effect that merely resembles what is missing, so the innovations must support it too:
+    once, for one effect, not for one among many.
     """
     calibration = state.trial.calibration
     fit = about_trajectory(calibration.problem, calibration.optimum)
     screenings = screened(state.trial, fit, TRAJECTORY_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
-    n_tried = max(len(ranked) for ranked in rankings)
+    n_tried = _n_tried(state, rankings, fallback=fallback)
     judged = []
     for effect in refined(fit, shortlist(rankings, needed, N_TRAJECTORY_REFITS)):
         trial = try_on_trajectories(state.trial, (*state.trial.present_effects, effect))
@@ -212,9 +214,18 @@ def _extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bo
             judged.append(Judged(found, weigh_trajectories(state.trial, trial, n_tried), trial))
     likely = [j for j in judged if j.evidence.log_bayes_factor > needed]
     settled = [replace(j, trial=resettled(state.trial, j.trial)) for j in sorted(likely, key=_worth)[:N_VALIDATED]]
-    supported = [j for j in settled if weigh(state.trial, j.trial, n_tried).log_bayes_factor > needed]
+    supported = [j for j in settled if weigh(state.trial, j.trial, 1).log_bayes_factor > needed]
     state.rejected += [j for j in judged if all(j.effects != s.effects for s in supported)]
     return _accept(state, supported, needed)
+
+
+def _n_tried(state: Search, rankings: Sequence[Sequence[Probe]], *, fallback: bool) -> int:
+    """Return how many effects and places were looked at: a fallback comes after all the named ones."""
+    n_own = max(len(ranked) for ranked in rankings)
+    if fallback:
+        return state.n_named + n_own
+    state.n_named = n_own
+    return n_own
 
 
 def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) -> list[tuple[Effect, ...]]:
