@@ -295,13 +295,14 @@ def test_a_pair_has_no_order(kind: type[Effect]) -> None:
 
 
 @each_effect
-def test_amplitudes_that_are_not_physical_are_refused(kind: type[Effect]) -> None:
+def test_amplitudes_that_are_not_physical_are_refused_or_put_on_their_bound(kind: type[Effect]) -> None:
     effect = null_effects(kind)[0]
     qualities = [effect.qualities()[i] for i in effect.amplitudes]
     far = effect.with_amplitudes(np.full(len(qualities), -1.0e6))
-    assert (far is None) == any(q.positive for q in qualities)
+    assert (far is None) == any(q.positive and not q.null for q in qualities)
     if far is not None:
         assert all(q.lower is None or far.values[q.name] == q.lower for q in qualities)
+        assert all(far.values[q.name] > 0.0 for q in qualities if q.positive)
 
 
 def rows() -> dict[str, str]:
