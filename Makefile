@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+BENCH := $(VENV)/.bench
 
 .PHONY: demo test test-fast check bench bench-paper-b serve clean
 
@@ -11,6 +12,10 @@ $(STAMP): pyproject.toml
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet torch==2.13.0
 	$(BIN)/pip install --quiet --editable ".[dev]"
+	touch $@
+
+$(BENCH): $(STAMP)
+	$(BIN)/pip install --quiet --editable ".[bench]"
 	touch $@
 
 demo: $(STAMP)
@@ -30,7 +35,7 @@ check: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
 
-bench-paper-b: $(STAMP)
+bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b
 
 serve: $(STAMP)

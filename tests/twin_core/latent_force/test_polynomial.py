@@ -1,15 +1,21 @@
 """The polynomial heat: recovery, its band, its range, its form as an effect."""
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from tests.helpers import every_term_network
+from twin_core.effects import effect_from_json, effect_to_json
+from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.errors import ModelError
 from twin_core.gp.basis import Basis
 from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.polynomial import regress_pointwise
+from twin_core.network.terms import Along
 
 T = np.linspace(290.0, 330.0, 41)
 
@@ -64,6 +70,37 @@ def test_vanishing_basis_has_no_heat_without_difference():
     np.testing.assert_allclose(found.predict(T, boundary).mean_W, -0.5 * (T - 280.0) ** 2, atol=1e-8)
     moved = found.predict(T + 7.0, boundary + 7.0)
     np.testing.assert_allclose(moved.mean_W, -0.5 * (T - 280.0) ** 2, atol=1e-8)
+
+
+@pytest.mark.parametrize("form", ["own temperature", "boundary", "still boundary", "vanishing"])
+def test_the_effect_is_the_same_polynomial(form):
+    """Usable at once: mean, slopes at the edge and doubt beyond it in a network are those of the prediction."""
+    network = every_term_network()
+    room = np.full(41, 290.0) if form == "still boundary" else np.linspace(285.0, 295.0, 41)
+    boundary = None if form == "own temperature" else room
+    law = regress_pointwise(
+        T,
+        _heat(T) + 0.3 * (room - 290.0),
+        np.full(41, 0.1),
+        degree=3,
+        boundary_K=boundary,
+        vanishing=form == "vanishing",
+    )
+    settings, values = law.effect_settings()
+    where = {"node": "b"} if boundary is None else {"node": "b", "boundary": "room"}
+    effect = effect_from_json(json.loads(json.dumps(effect_to_json(LearnedHeatFlow(where, values, settings)))))
+    t, b = np.linspace(280.0, 340.0, 200), np.linspace(280.0, 300.0, 200)
+    nodes, ends = np.tile(t[:, None], 3), np.tile(b[:, None], 3)
+    along = Along(np.arange(200.0), nodes, ends, {}, np.ones(200))
+    term = effect.addition(network.layout).terms[0]
+    found = term.evaluate(along, np.array(list(values.values()))).heat_W[:, 0]
+    told = law.predict(t, None if boundary is None else b)
+    np.testing.assert_allclose(found, told.mean_W, rtol=1e-12)
+    beyond = effect.beyond(network.layout, along)
+    assert beyond is not None and network.nodes[beyond.node] == "b"
+    np.testing.assert_array_equal(beyond.outside, told.outside)
+    np.testing.assert_allclose(beyond.std_W, told.beyond_W, rtol=1e-12)
+    assert ("room" in beyond.visited) == (boundary is not None)
 
 
 WEIGHTS = arrays(np.float64, 21, elements=st.floats(-10.0, 10.0))
