@@ -9,6 +9,7 @@ from service.instants import now_us
 from service.messages import EventStretch, Stretch
 from service.store import anomalies, events, jobs, models
 from service.workbench import Outcome
+from twin_core.anomaly.detect import TOGETHER
 
 Json = dict[str, Any]
 
@@ -63,7 +64,8 @@ def _explain(connection: sqlite3.Connection, twin: int, finished: Finished) -> N
         return
     for finding in finished.outcome.report["findings"]:
         cause = {"effect": finding["effect"], "where": finding["where"], "diagnosis": finished.job}
-        anomalies.explain(connection, twin, _sensors_at(finished.outcome.document["spec"], finding["where"]), cause)
+        sensors = _sensors_at(finished.outcome.document["spec"], finding["where"])
+        anomalies.explain(connection, twin, [*sensors, TOGETHER], cause)
 
 
 def _sensors_at(specification: Json, where: Json) -> list[str]:

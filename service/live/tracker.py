@@ -21,7 +21,7 @@ from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
 from service.workbench import Filtered, Telemetry
-from twin_core.anomaly import detect
+from twin_core.anomaly import Thresholds, detect
 from twin_core.errors import TwinError
 
 log = logging.getLogger("service.live")
@@ -95,13 +95,13 @@ class _Caution:
 class Tracker:
     """Keeps one twin's state up to date in the background."""
 
-    def __init__(self, twin: Entry, database: Database, hub: Hub, engine: Engine) -> None:
+    def __init__(self, twin: Entry, database: Database, hub: Hub, engine: Engine, thresholds: Thresholds) -> None:
         """Start in the background; the state comes from the last checkpoint."""
         self.twin = twin
         self.active: Active | None = None
         self.position: Position | None = None
         self.trouble: str | None = None
-        self._database, self._hub, self._engine = database, hub, engine
+        self._database, self._hub, self._engine, self._thresholds = database, hub, engine, thresholds
         self._caution = _Caution()
         self._news, self._wake, self._idle = _News(), asyncio.Event(), asyncio.Event()
         self._wake.set()
@@ -205,25 +205,26 @@ class Tracker:
             return True
         caution.succeeded()
         self.trouble = None
-        await self._keep(active, before, fresh.time_us, done, held, told)
+        await self._keep(active, before, fresh, done, held, told)
         return True
 
     async def _keep(
         self,
         active: Active,
         before: Position | None,
-        time_us: NDArray[np.int64],
+        fresh: Samples,
         done: Filtered,
         held: dict[str, float],
         told: NDArray[np.int64],
     ) -> None:
         """Look for anomalies in an assimilated block and write everything down."""
+        time_us = fresh.time_us
         new = slice(-time_us.size, None)
         innovation, std, nis = done.innovation_K[new], done.innovation_std_K[new], done.nis[new]
-        detector, intervals = detect(
-            None if before is None else before.detector, done.sensors, time_us, innovation, std
-        )
-        changes = [Change(i.sensor, "residual", i.start, i.stop, i.score) for i in intervals]
+        detector = None if before is None else before.detector
+        reading = fresh.values[[self.twin.channels.index(s) for s in done.sensors]].T
+        detector, intervals = detect(detector, done.sensors, time_us, reading, innovation, std, nis, self._thresholds)
+        changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
         after = Position(int(time_us[-1]), count, done.state, held, detector, _sampling_s(time_us, before))
         step = Step(active.version, time_us, innovation, std, nis, np.isin(time_us, told), changes, after.checkpoint())

@@ -20,6 +20,11 @@ export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies 
   return unitName(unit);
 }
 
+const KINDS = {
+  residual: "departs from its model", stuck: "is stuck", quantised: "reads in coarser steps", dropout: "does not report",
+  joint: "together depart from the model",
+};
+
 export function drawAnomalies(list, anomalies, sensors, onPick) {
   if (!anomalies.length) return list.replaceChildren(quiet("Every sensor behaves as its model says."));
   list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
@@ -27,11 +32,12 @@ export function drawAnomalies(list, anomalies, sensors, onPick) {
     const open = anomaly.stop === null, start = seconds(anomaly.start);
     const cause = anomaly.cause ? effectWords(anomaly.cause) : open ? "cause unknown yet" : `seen by model v${anomaly.model_version}`;
     const length = open ? "lasts" : `for ${span(Math.max(1, seconds(anomaly.stop) - start))}`;
-    return make("li", {}, make("button", { class: "item", onclick: () => onPick(anomaly), "aria-label": `Show anomaly of ${anomaly.sensor}` },
+    const name = anomaly.sensor === "*" ? "all sensors" : anomaly.sensor;
+    return make("li", {}, make("button", { class: "item", onclick: () => onPick(anomaly), "aria-label": `Show anomaly of ${name}` },
       make("div", { class: "row" },
-        make("span", { class: "dot", style: `background:${colour(Math.max(index, 0))}` }), make("b", {}, anomaly.sensor),
+        make("span", { class: "dot", style: `background:${colour(Math.max(index, 0))}` }), make("b", {}, name),
         make("span", { class: `chip ${open ? "bad" : ""}` }, `${number(anomaly.score, 1)} σ`)),
-      make("div", { class: "message" }, `${clock(start)} · ${length} · ${cause}`)));
+      make("div", { class: "message" }, `${KINDS[anomaly.kind] || anomaly.kind} · ${clock(start)} · ${length} · ${cause}`)));
   }));
 }
 
