@@ -71,12 +71,14 @@ async def list_residuals(
     await tracker.settled(forecasts.SETTLE_S)
     chosen = version or (tracker.active.version if tracker.active is not None else 0)
     n_sensors = len(twin.sensors)
-    found = await service.database.read(residuals.select, twin.key, chosen, n_sensors, start_us, stop_us)
-    document = await asyncio.to_thread(_render, twin, found, max_points)
+    found, count = await service.database.read(
+        residuals.overview, twin.key, chosen, n_sensors, start_us, stop_us, max_points
+    )
+    document = await asyncio.to_thread(_render, twin, found, count, max_points)
     return Response(document, media_type="application/json")
 
 
-def _render(twin: Entry, found: Found, max_points: int) -> bytes:
+def _render(twin: Entry, found: Found, count: int, max_points: int) -> bytes:
     kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
 
     def columns(matrix: Any) -> dict[str, Any]:
@@ -88,8 +90,8 @@ def _render(twin: Entry, found: Found, max_points: int) -> bytes:
         "std_K": columns(found.innovation_std_K),
         "nis": np.ascontiguousarray(found.nis[kept]),
         "model_version": [found.version] * int(kept.size),
-        "samples": int(found.time_us.size),
-        "downsampled": kept.size < found.time_us.size,
+        "samples": count,
+        "downsampled": kept.size < count,
     }
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
 

@@ -124,8 +124,10 @@ async def archive(
     names = _named(channels, twin)
     start_us, stop_us = span(start, stop)
     rows = [twin.channels.index(name) for name in names]
-    found = await service.database.read(samples.select, twin.key, len(twin.channels), rows, start_us, stop_us)
-    document = await asyncio.to_thread(_render, found, names, twin, max_points)
+    found, count = await service.database.read(
+        samples.overview, twin.key, len(twin.channels), rows, start_us, stop_us, max_points
+    )
+    document = await asyncio.to_thread(_render, found, count, names, twin, max_points)
     return Response(document, media_type="application/json")
 
 
@@ -148,7 +150,7 @@ def _named(channels: str | None, twin: Entry) -> list[str]:
     return names
 
 
-def _render(found: Samples, names: list[str], twin: Entry, max_points: int) -> bytes:
+def _render(found: Samples, count: int, names: list[str], twin: Entry, max_points: int) -> bytes:
     kept = extremes(found.values, max_points)
     values = found.values[:, kept]
     columns = {name: np.ascontiguousarray(values[row]) for row, name in enumerate(names)}
@@ -156,7 +158,7 @@ def _render(found: Samples, names: list[str], twin: Entry, max_points: int) -> b
         "time": format_instants(found.time_us[kept]),
         "values": columns,  # orjson writes NaN as null
         "units": {name: twin.units[name] for name in names},
-        "samples": int(found.time_us.size),
-        "downsampled": kept.size < found.time_us.size,
+        "samples": count,
+        "downsampled": kept.size < count,
     }
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)

@@ -140,10 +140,27 @@ def _residuals_and_anomalies(connection: sqlite3.Connection) -> None:
     )
 
 
+def _outlines(connection: sqlite3.Connection) -> None:
+    """Add outlines of large chunks; chunks that were stored before have none and are read whole."""
+    for table in ("chunk", "residual"):
+        _run(
+            connection,
+            f"""
+            CREATE TABLE {table}_outline (
+                chunk INTEGER PRIMARY KEY REFERENCES {table}(id) ON DELETE CASCADE,
+                instants INTEGER NOT NULL,
+                time BLOB NOT NULL,
+                value BLOB NOT NULL
+            );
+            """,
+        )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
     ("residuals and anomalies", _residuals_and_anomalies),
+    ("outlines", _outlines),
 )
 
 

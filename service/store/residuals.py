@@ -10,6 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.store import outline
+
+MOST_SMALL_CHUNKS = 64
+"""So many small chunks in a row are rewritten as one."""
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -60,10 +65,33 @@ def _unpack(n_sensors: int, version: int, seq: bytes, time: bytes, value: bytes)
 
 
 def append(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> None:
-    """Store residuals."""
+    """Store residuals, and gather the last chunks into one if there are many small ones."""
     if residuals.time_us.size == 0:
         return
-    connection.execute(
+    _insert(connection, twin, residuals)
+    if residuals.time_us.size < outline.PIECE:
+        _compact(connection, twin, residuals.version, residuals.innovation_K.shape[0])
+
+
+def _compact(connection: sqlite3.Connection, twin: int, version: int, n_sensors: int) -> None:
+    """Rewrite the last chunks as one if all of them are small: samples that come one by one make one chunk each."""
+    rows = connection.execute(
+        "SELECT id, n FROM residual WHERE twin = ? AND version = ? ORDER BY last_us DESC LIMIT ?",
+        (twin, version, MOST_SMALL_CHUNKS),
+    ).fetchall()
+    if len(rows) < MOST_SMALL_CHUNKS or max(n for _, n in rows) >= outline.PIECE:
+        return
+    found = []
+    for chunk, _ in reversed(rows):
+        row = connection.execute("SELECT seq, time, value FROM residual WHERE id = ?", (chunk,)).fetchone()
+        found.append(_unpack(n_sensors, version, *row))
+        connection.execute("DELETE FROM residual WHERE id = ?", (chunk,))
+    _insert(connection, twin, _join(found, n_sensors, version))
+
+
+def _insert(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> None:
+    packed = _pack(residuals)
+    row = connection.execute(
         """INSERT INTO residual (twin, version, n, first_us, last_us, last_seq, seq, time, value)
            VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)""",
         (
@@ -75,9 +103,10 @@ def append(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> N
             int(residuals.seq.max()),
             np.ascontiguousarray(residuals.seq, dtype="<i8").data,
             np.ascontiguousarray(residuals.time_us, dtype="<i8").data,
-            np.ascontiguousarray(_pack(residuals), dtype="<f8").data,
+            np.ascontiguousarray(packed, dtype="<f8").data,
         ),
     )
+    outline.put(connection, "residual", int(row.lastrowid or 0), residuals.time_us, packed)
 
 
 def truncate(connection: sqlite3.Connection, twin: int, version: int, n_sensors: int, after_us: int) -> None:
@@ -109,6 +138,39 @@ def select(
     found = [_unpack(n_sensors, version, *row) for row in connection.execute(query, (twin, start, stop, version))]
     whole = _join(found, n_sensors, version)
     return whole.take((whole.time_us >= start) & (whole.time_us < stop))
+
+
+def overview(
+    connection: sqlite3.Connection,
+    twin: int,
+    version: int,
+    n_sensors: int,
+    start_us: int | None,
+    stop_us: int | None,
+    max_points: int,
+) -> tuple[Residuals, int]:
+    """Return residuals among which are the extremes of start <= time < stop, and how many there are in all."""
+    start = start_us if start_us is not None else -(2**62)
+    stop = stop_us if stop_us is not None else 2**62
+    query = """SELECT id, first_us, last_us, n FROM residual WHERE twin = ? AND last_us >= ? AND first_us < ?
+               AND version = ? ORDER BY first_us"""
+    spans = connection.execute(query, (twin, start, stop, version)).fetchall()
+    n_rows = 2 * n_sensors + 1
+    if sum(span[3] for span in spans) // outline.PIECE * 2 * n_rows < max_points:
+        found = select(connection, twin, version, n_sensors, start_us, stop_us)
+        return found, int(found.time_us.size)
+    chosen, left_out = [], 0
+    for part in outline.parts(connection, "residual", [span[:3] for span in spans], start, stop, n_rows):
+        if part.time_us is None or part.values is None:
+            row = connection.execute("SELECT seq, time, value FROM residual WHERE id = ?", (part.chunk,)).fetchone()
+            chosen.append(_unpack(n_sensors, version, *row))
+        else:
+            unnumbered = np.zeros(part.time_us.size, dtype="<i8").tobytes()
+            chosen.append(_unpack(n_sensors, version, unnumbered, part.time_us.tobytes(), part.values.tobytes()))
+            left_out += part.instants - part.time_us.size
+    whole = _join(chosen, n_sensors, version)
+    found = whole.take((whole.time_us >= start) & (whole.time_us < stop))
+    return found, int(found.time_us.size) + left_out
 
 
 def _join(parts: list[Residuals], n_sensors: int, version: int) -> Residuals:

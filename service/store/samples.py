@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.frames import Batch
+from service.store import outline
 from service.store.gone import TwinGone
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, EMPTY, collapse, merge
 
@@ -137,7 +138,7 @@ def _insert(
     time_us: NDArray[np.int64],
     values: NDArray[np.float64],
 ) -> None:
-    connection.execute(
+    row = connection.execute(
         "INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
         (
             twin,
@@ -150,6 +151,7 @@ def _insert(
             np.ascontiguousarray(values, dtype="<f8").data,
         ),
     )
+    outline.put(connection, "chunk", int(row.lastrowid or 0), time_us, values)
 
 
 def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> None:
@@ -221,6 +223,45 @@ def select(
         values.append(matrix if whole else matrix[:, inside])
     time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
     return Samples(*collapse(time_us, matrix)) if time_us.size else Samples(time_us, matrix)
+
+
+def overview(
+    connection: sqlite3.Connection,
+    twin: int,
+    n_channels: int,
+    rows: Sequence[int],
+    start_us: int | None,
+    stop_us: int | None,
+    max_points: int,
+) -> tuple[Samples, int]:
+    """Return samples among which are the extremes of start <= time < stop, and how many there are in all.
+
+    Everything is returned where the outlines would hold fewer than ``max_points`` samples.
+    """
+    start = start_us if start_us is not None else -(2**62)
+    stop = stop_us if stop_us is not None else 2**62
+    query = (
+        "SELECT id, first_us, last_us, n FROM chunk WHERE twin = ? AND last_us >= ? AND first_us < ? ORDER BY first_us"
+    )
+    spans = connection.execute(query, (twin, start, stop)).fetchall()
+    if sum(span[3] for span in spans) // outline.PIECE * 2 * n_channels < max_points:
+        found = select(connection, twin, n_channels, rows, start_us, stop_us)
+        return found, int(found.time_us.size)
+    chosen = list(rows)
+    times, values = [np.empty(0, dtype=np.int64)], [np.empty((len(chosen), 0))]
+    left_out = 0
+    for part in outline.parts(connection, "chunk", [span[:3] for span in spans], start, stop, n_channels):
+        time_us, matrix = part.time_us, part.values
+        if time_us is None or matrix is None:
+            time, value = connection.execute("SELECT time, value FROM chunk WHERE id = ?", (part.chunk,)).fetchone()
+            time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)
+        else:
+            left_out += part.instants - time_us.size
+        inside = (time_us >= start) & (time_us < stop)
+        times.append(time_us[inside])
+        values.append(matrix[chosen][:, inside])
+    found = Samples(*collapse(np.concatenate(times), np.concatenate(values, axis=1)))
+    return found, int(found.time_us.size) + left_out
 
 
 def since_seq(

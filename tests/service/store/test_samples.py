@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from service.frames import Batch
-from service.store import events, samples, twins
+from service.store import events, residuals, samples, twins
 from service.store.database import Database
+from service.store.residuals import Residuals
 
 SPEC = {"twin": "t", "channels": {"a": {}, "b": {}}}
 
@@ -80,3 +81,58 @@ def test_blocks_cover_everything_once(connection: sqlite3.Connection) -> None:
         seen += found.time_us.size - 1
         position = int(found.time_us[-1])
     assert seen == 20_000
+
+
+def wave(first: int, count: int) -> Batch:
+    """Return noise with one spike, so that every stretch has extremes of its own."""
+    generator = np.random.default_rng(first)
+    values = generator.normal(size=(2, count))
+    values[0, count // 3], values[1, count // 2] = 50.0 + first / 1e6, -50.0 - first / 1e6
+    return Batch((first + np.arange(count, dtype=np.int64)) * 1000, values)
+
+
+def test_an_overview_holds_every_extreme(connection: sqlite3.Connection) -> None:
+    for first in (0, 20_000, 40_000, 60_000):
+        samples.append(connection, 1, wave(first, 15_000))
+    late = Batch(np.array([62_000_500, 62_001_500]), np.array([[99.0, -99.0], [np.nan, 0.0]]))
+    samples.append(connection, 1, late)
+    for start, stop, rows in ((None, None, [0, 1]), (5_000_000, 72_000_000, [1]), (61_000_000, 64_000_000, [0])):
+        whole = samples.select(connection, 1, 2, rows, start, stop)
+        found, count = samples.overview(connection, 1, 2, rows, start, stop, 40)
+        assert count == whole.time_us.size
+        assert (np.diff(found.time_us) > 0).all()
+        np.testing.assert_array_equal(np.nanmax(found.values, axis=1), np.nanmax(whole.values, axis=1))
+        np.testing.assert_array_equal(np.nanmin(found.values, axis=1), np.nanmin(whole.values, axis=1))
+        assert np.isin(found.time_us, whole.time_us).all()
+        assert found.time_us[[0, -1]].tolist() == whole.time_us[[0, -1]].tolist()
+    assert (
+        samples.overview(connection, 1, 2, [0, 1], None, None, 40)[0].time_us.size < 60_000 / 3
+    )  # the chunk that others overlap is read whole
+    everything, count = samples.overview(connection, 1, 2, [0, 1], None, None, 100_000)
+    assert everything.time_us.size == count == 60_002
+
+
+def residual_stretch(first: int, count: int) -> Residuals:
+    time_us = (first + np.arange(count, dtype=np.int64)) * 1000
+    noise = np.random.default_rng(first).normal(size=(5, count))
+    return Residuals(time_us // 1000 + 1, time_us, noise[:2], noise[2:4] ** 2, noise[4] ** 2, 1)
+
+
+def test_residuals_one_by_one_are_gathered_and_outlined(connection: sqlite3.Connection) -> None:
+    stretches = [residual_stretch(0, 5000), *(residual_stretch(5000 + k, 1) for k in range(700))]
+    connection.execute("BEGIN")
+    for stretch in stretches:
+        residuals.append(connection, 1, stretch)
+    connection.execute("COMMIT")
+    assert connection.execute("SELECT count(*) FROM residual").fetchone()[0] < 80
+    whole = residuals.select(connection, 1, 1, 2)
+    np.testing.assert_array_equal(whole.time_us, np.arange(5700) * 1000)
+    np.testing.assert_array_equal(whole.nis, np.concatenate([s.nis for s in stretches]))
+    found, count = residuals.overview(connection, 1, 1, 2, None, None, 20)
+    assert count == 5700 and found.time_us.size < 1500
+    assert found.nis.max() == whole.nis.max() and found.innovation_K.min() == whole.innovation_K.min()
+    assert [s.seq[-1] for s in residuals.since_seq(connection, 1, 2, 5690)] and residuals.since_seq(
+        connection, 1, 2, 5700
+    ) == []
+    residuals.truncate(connection, 1, 1, 2, 5_100_000)
+    assert residuals.select(connection, 1, 1, 2).time_us.size == 5101

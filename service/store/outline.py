@@ -1,0 +1,92 @@
+"""Outlines: of every large chunk the samples that hold its extremes, so that a plot of years reads a twentieth of it.
+
+The extremes of a union are among the extremes of its parts: a plot drawn from outlines shows every spike that a plot of
+all samples would. Samples and residuals have the same kind of chunks, so both have outlines.
+"""
+
+import sqlite3
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.downsample import extremes
+from service.store.merge import collapse
+
+Table = Literal["chunk", "residual"]
+
+PIECE = 512
+"""Of so many samples the outline keeps those in which any row has its least or greatest value."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One chunk of a plot: its outline, or None where all of it is needed, and how many instants it holds."""
+
+    chunk: int
+    instants: int
+    time_us: NDArray[np.int64] | None
+    values: NDArray[np.float64] | None
+
+
+def put(
+    connection: sqlite3.Connection, table: Table, chunk: int, time_us: NDArray[np.int64], values: NDArray[np.float64]
+) -> None:
+    """Store the outline of a chunk, unless the chunk is small.
+
+    Parameters
+    ----------
+    time_us, values : (n_times,), (n_rows, n_times)
+        The chunk, in any order.
+    """
+    if time_us.size < PIECE:
+        return
+    time_us, values = collapse(time_us, values)
+    kept = extremes(values, 2 + 2 * values.shape[0] * (time_us.size // PIECE))
+    connection.execute(
+        f"INSERT INTO {table}_outline (chunk, instants, time, value) VALUES (?, ?, ?, ?)",
+        (
+            chunk,
+            int(time_us.size),
+            np.ascontiguousarray(time_us[kept], dtype="<i8").data,
+            np.ascontiguousarray(values[:, kept], dtype="<f8").data,
+        ),
+    )
+
+
+def parts(
+    connection: sqlite3.Connection,
+    table: Table,
+    spans: list[tuple[int, int, int]],
+    start_us: int,
+    stop_us: int,
+    n_rows: int,
+) -> list[Part]:
+    """Return chunks with their outlines; one that the interval cuts, or that overlaps another one, has none.
+
+    Parameters
+    ----------
+    spans
+        (id, first instant, last instant) of chunks, in the order of the first instant.
+    start_us, stop_us
+        The interval wanted.
+    n_rows
+        Rows of a chunk's values.
+    """
+    first, last = (np.array([span[i] for span in spans], dtype=np.int64) for i in (1, 2))
+    reach = np.maximum.accumulate(last)
+    apart = np.ones(len(spans), dtype=np.bool_)
+    apart[1:] &= first[1:] > reach[:-1]
+    apart[:-1] &= last[:-1] < first[1:]
+    whole = apart & (first >= start_us) & (last < stop_us)
+    found = []
+    for (chunk, _, _), is_whole in zip(spans, whole.tolist(), strict=True):
+        query = f"SELECT instants, time, value FROM {table}_outline WHERE chunk = ?"
+        row = connection.execute(query, (chunk,)).fetchone() if is_whole else None
+        if row is None:
+            found.append(Part(chunk, 0, None, None))
+        else:
+            values = np.frombuffer(row[2], dtype="<f8").reshape(n_rows, -1)
+            found.append(Part(chunk, row[0], np.frombuffer(row[1], dtype="<i8"), values))
+    return found
