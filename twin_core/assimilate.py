@@ -24,7 +24,7 @@ from twin_core.telemetry import Record
 N_PASSES = 3
 START_STD_SENSED_K = 2.0
 START_STD_HIDDEN_K = 20.0
-FLOOR_SHARE = 0.01
+FLOOR_SHARE = 0.02
 """Process noise per sample is at least this share of the sensor noise: a filter that is certain of itself goes deaf."""
 
 
@@ -72,7 +72,8 @@ def process_noise_K2_per_s(model: CalibratedModel, network: Network, sampling_s:
     """Return the spectral density of the process noise of each state, (n_nodes,).
 
     The misfit of the calibration, an Ornstein-Uhlenbeck process, moves by 2 sigma^2 h / length within a short time h;
-    the process noise is given the same growth. A state that nobody reads gets the mean of those that are read.
+    the process noise is given the same growth. Each state gets the mean of those that are read at least: where the
+    calibration saw no misfit at all, or where nobody reads, the model is hardly better than elsewhere.
     """
     density = np.zeros(len(network.nodes))
     read = np.zeros(len(network.nodes), dtype=np.bool_)
@@ -81,8 +82,8 @@ def process_noise_K2_per_s(model: CalibratedModel, network: Network, sampling_s:
         floor = (FLOOR_SHARE * model.noise_K[sensor]) ** 2 / sampling_s
         density[node] = max(density[node], growth, floor)
         read[node] = True
-    density[~read] = density[read].mean()
-    return density
+    mean = density[read].mean()
+    return np.where(read, np.maximum(density, mean), mean)
 
 
 def assimilate(model: CalibratedModel, record: Record, state: Json | None = None) -> Assimilation:
