@@ -10,6 +10,12 @@ from typing import Self
 from service.client import Retry, TwinClient
 
 READY = "listening on "
+FAKE = (
+    "from service.server import serve; from service.settings import read_settings;"
+    "from tests.service.fakes import FakeWorkbench;"
+    "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)"
+)
+"""A server whose workbench answers at once."""
 
 
 class Server:

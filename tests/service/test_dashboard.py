@@ -7,20 +7,14 @@ import pytest
 
 from tests.service.browser import BINARY, Browser
 from tests.service.conftest import SPEC
-from tests.service.server import Server
+from tests.service.server import FAKE, Server
 
 pytestmark = [pytest.mark.browser, pytest.mark.e2e, pytest.mark.skipif(BINARY is None, reason="no Chromium here")]
-
-SCRIPT = (
-    "import sys; from service.server import serve; from service.settings import read_settings;"
-    "from tests.service.fakes import FakeWorkbench;"
-    "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)"
-)
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    with Server(tmp_path, command=SCRIPT) as running:
+    with Server(tmp_path, command=FAKE) as running:
         yield running
 
 
@@ -109,7 +103,7 @@ def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
 
 
 def test_a_key_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
-    with Server(tmp_path, command=SCRIPT, api_keys="read:sesame,operate:o") as server:
+    with Server(tmp_path, command=FAKE, api_keys="read:sesame,operate:o") as server:
         server.client("o").register(SPEC)
         with Browser(tmp_path / "profile") as page:
             page.open(server.url)

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from service.settings import read_settings
 from service.store.database import Database
 from service.store.lock import StoreError
 from tests.service.conftest import SPEC
-from tests.service.server import Server
+from tests.service.server import FAKE, Server
 
 pytestmark = pytest.mark.e2e
 
@@ -84,6 +85,80 @@ def test_a_job_interrupted_by_a_kill_is_marked_failed_and_leaves_no_process(tmp_
         assert "interrupted" in job.message
 
 
+class Switcher(threading.Thread):
+    """Activates one version after the other and remembers the last one that was confirmed."""
+
+    def __init__(self, client: TwinClient) -> None:
+        super().__init__()
+        self._client = client
+        self.confirmed = 0
+        self.count = 0
+
+    def run(self) -> None:
+        with contextlib.suppress(Unreachable):
+            while True:
+                version = 1 + self.count % 2
+                self._client.activate("benchsat", version)
+                self.confirmed, self.count = version, self.count + 1
+
+
+def test_a_kill_during_activation_leaves_one_whole_model_active(tmp_path: Path) -> None:
+    with Server(tmp_path, command=FAKE) as server:
+        client = server.client()
+        client.register(SPEC)
+        client.ingest("benchsat", [60.0 * k for k in range(50)], {"T_px": [290.0 + k % 7 for k in range(50)]})
+        for _ in range(2):
+            client._http.post("/v1/twins/benchsat/models", json={"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0})
+        for attempt in range(3):
+            switcher = Switcher(server.client())
+            switcher.start()
+            while switcher.count < 5 + attempt:
+                assert switcher.is_alive()
+                time.sleep(0.002)
+            server.kill()
+            switcher.join()
+            server.start()
+            client = server.client()
+            active = [model.version for model in client.models("benchsat") if model.active]
+            # The last confirmed switch stands, or the one under way, and everybody agrees on it.
+            assert active in ([switcher.confirmed], [3 - switcher.confirmed])
+            assert client.twin("benchsat").active_model == active[0]
+            log = client._http.get("/v1/twins/benchsat/models").json()["activations"]
+            assert log[0]["version"] == active[0]
+            assert set(client.residuals("benchsat").model_version) == {active[0]}
+
+
+def test_a_worker_that_is_killed_is_replaced(tmp_path: Path) -> None:
+    with Server(tmp_path, command=FAKE) as server:
+        client = server.client()
+        client.register(SPEC)
+        rows = range(200)
+        client.ingest(
+            "benchsat", [60.0 * k for k in rows], {"T_px": [290.0 + k % 7 for k in rows], "Q_px": [0.5] * 200}
+        )
+        assert client.wait("benchsat", client.calibrate("benchsat")).state == "succeeded"
+        assert len(client.residuals("benchsat").time) == 200
+        for worker in _children(server.process.pid):
+            os.kill(worker, signal.SIGKILL)
+        client.ingest("benchsat", [60.0 * 200], {"T_px": [291.0]})
+        assert len(client.residuals("benchsat").time) == 201
+        assert client.forecast("benchsat", 600.0, step_s=60.0).model_version == 1
+        assert "another one takes over" in server.log()
+
+
+def _children(process: int) -> list[int]:
+    """Return the worker processes of a server: those that have started Python anew."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                status = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+                if int(status[1]) == process and b"spawn_main" in (entry / "cmdline").read_bytes():
+                    found.append(int(entry.name))
+    assert found
+    return found
+
+
 def _wait_until_group_is_gone(group: int) -> None:
     for _ in range(300):
         try:
@@ -148,7 +223,7 @@ def test_full_disk_is_507_and_recovers(tmp_path: Path) -> None:
         assert refusal.status == 507
         assert client.twin("benchsat").samples == stored
         assert client.archive("benchsat").samples == stored
+        resource.prlimit(server.process.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+        assert client.ingest("benchsat", times, {"Q_px": times}).accepted == 1000  # by itself, once there is room
     with Server(tmp_path) as server:
-        client = server.client()
-        assert client.archive("benchsat").samples == stored
-        assert client.ingest("benchsat", times, {"Q_px": times}).accepted == 1000
+        assert server.client().archive("benchsat").samples == stored + 1000

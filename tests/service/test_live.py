@@ -111,6 +111,26 @@ def test_an_archive_that_cannot_be_assimilated_says_why(client: AppClient) -> No
     assert list(residuals(client).values()) == [0.0]
 
 
+@pytest.mark.parametrize("jump_s", [-86_400.0, 86_400.0])
+def test_a_jump_of_the_clock_changes_nothing_but_its_own_reading(
+    client: AppClient, monkeypatch: pytest.MonkeyPatch, jump_s: float
+) -> None:
+    squares(client)
+    before = client.get(f"{TWIN}/calibrations").json()["jobs"][0]
+    real_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real_ns() + int(jump_s * 1e9))
+    send(client, [100], [SCALE_K * 10_000])
+    calibrate(client)
+    assert len(residuals(client)) == 101
+    after = client.get(f"{TWIN}/calibrations").json()["jobs"]
+    assert [job["id"] for job in after][1] == before["id"]  # the newest first, whatever the clock says
+    assert after[0]["created"] <= after[0]["started"] <= after[0]["finished"]
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()["model_version"] == 2
+    assert client.get(TWIN).json()["active_model"] == 2
+    numbers = [row["version"] for row in client.get(f"{TWIN}/models").json()["activations"]]
+    assert numbers == [2, 1]
+
+
 def test_another_model_has_residuals_of_its_own(client: AppClient) -> None:
     squares(client)
     calibrate(client)
