@@ -21,6 +21,7 @@ CASES = {
     "leak_to_boundary": 1,
     "missing_conductor": 1,
     "input_gain": 1,
+    "input_step": 1,
 }
 """Effect -> seed of a small spacecraft over five orbits, a sample every three minutes."""
 
@@ -74,6 +75,16 @@ def test_the_held_out_error_falls_to_the_noise(run: Run) -> None:
     assert after < 0.8 * before
     assert after < 1.5 * run.report["noise_floor_K"]
     assert run.report["residual_whiteness"]["after"] < run.report["residual_whiteness"]["before"]
+
+
+def test_an_onset_is_told_in_the_telemetrys_own_form() -> None:
+    run = solved("input_step")
+    assert run.case.onset_s is not None
+    (finding,) = [f for f in run.report["findings"] if f["effect"] == "input_step"]
+    time = finding["parameters"]["time"]
+    span = float(run.case.record.time_s[-1])
+    assert abs(time["mean"] - run.case.onset_s) < 0.02 * span
+    assert 0.0 < time["std"] < 0.02 * span
 
 
 def test_the_corrected_model_carries_the_effect(run: Run) -> None:
