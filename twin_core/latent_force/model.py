@@ -241,6 +241,6 @@ def _prior_std_K(given: FloatArray | float, n: int, noise_std_K: FloatArray) -> 
         node = int(np.argmax(std))
         raise ModelError(
             f"prior_std_K[{node}]: {std[node]:g} K beside a sensor noise of {limit / VAGUEST:g} K is more than double "
-            f"precision carries; give at most {limit:g} K, or 1000 K: no temperature is further from any guess"
+            f"precision carries; give at most {limit:g} K, and a mean that near"
         )
     return std
