@@ -180,15 +180,18 @@ def measured_section(folder: Path) -> str:
                 case.where,
                 " / ".join(f"{e:.3f}" for e in case.rms_without),
                 " / ".join(f"{e:.3f}" for e in case.rms_with),
+                f"{case.outside:.0%}",
                 "/".join(map(str, case.learned.degrees)),
                 f"{case.learned.log_bayes_factor:+.1f}",
                 f"{np.max(case.learned.misfit_W) / case.force_std_W:.0%}",
             ]
         )
-    header = ["network", "trained on", "tested on", "RMS without (K)", "RMS with learned convection (K)", "degrees"]
-    text = title + _table([*header, "ln Bayes factor", "left beside the curve"], rows)
+    header = ["network", "trained on", "tested on", "RMS without (K)", "RMS with learned convection (K)"]
+    header += ["outside", "degrees", "ln Bayes factor", "left beside the curve"]
+    text = title + _table(header, rows)
     text += (
-        "\nOpen loop, errors of blocks 1 / 2 / 3. The Bayes factor weighs the curves against a latent force that does not"
+        "\nOpen loop, errors of blocks 1 / 2 / 3. Outside is the share of the test at which a curve meets a temperature, of"
+        " its block or of the room, that it was not learned over; its heat is held there and the prediction says so. The Bayes factor weighs the curves against a latent force that does not"
         " repeat with temperature; the last column is the standard deviation of the heat that the curve leaves, as a"
         " share of the latent force's own.\n\n"
     )

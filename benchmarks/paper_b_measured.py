@@ -53,13 +53,17 @@ class Rig:
 
 @dataclass(frozen=True)
 class Case:
-    """One network, trained on the first hours: errors per block without and with the learned convection."""
+    """One network, trained on the first hours: errors per block without and with the learned convection.
+
+    ``outside`` is the share of the test, over times and blocks, at which a curve is used beyond what it was learned over.
+    """
 
     network: str
     train_h: float
     where: str
     rms_without: FloatArray
     rms_with: FloatArray
+    outside: float
     learned: LearnedHeatFlow
     force_std_W: float
 
@@ -112,7 +116,7 @@ def open_loop(rig: Rig, values: FloatArray, curves: Sequence[ForcePolynomial]) -
         ambient = np.array(rig.ambient[k])
 
         def rate(x: FloatArray, constant: FloatArray, ambient: FloatArray = ambient) -> FloatArray:
-            heat = [float(c.predict(np.array(t), ambient).mean_W) for t, c in zip(x, curves, strict=False)]
+            heat = [float(c.heat_W(np.array(t), ambient)) for t, c in zip(x, curves, strict=False)]
             return jacobian @ x + constant + np.array(heat or [0.0]) / capacity
 
         middle = state + 0.5 * step * rate(state, start)
@@ -126,8 +130,8 @@ def fit_network(rig: Rig, start: dict[str, float]) -> FloatArray:
     return fit_map(model(rig, (), None, tuple(start)), rig.blocks, {}, start).values
 
 
-def _rms(rig: Rig, values: FloatArray, curves: Sequence[ForcePolynomial]) -> FloatArray:
-    return np.sqrt(np.mean((open_loop(rig, values, curves) - rig.blocks) ** 2, axis=0))
+def _rms(rig: Rig, path: FloatArray) -> FloatArray:
+    return np.sqrt(np.mean((path - rig.blocks) ** 2, axis=0))
 
 
 def run_cases(rig: Rig, hours: Sequence[float]) -> list[Case]:
@@ -149,8 +153,10 @@ def run_cases(rig: Rig, hours: Sequence[float]) -> list[Case]:
                 plant, train.blocks, fit.values, force, boundary_K=train.ambient, vanishing=False, max_degree=3
             )
             for where, part in (("rest", rest), ("same hours", train)) if train_h == 8.0 else (("rest", rest),):
-                errors = (_rms(part, values, ()), _rms(part, values, learned.polynomials))
-                cases.append(Case(name, train_h, where, *errors, learned, fit.named()["std"]))
+                bare, curved = (open_loop(part, values, curves) for curves in ((), learned.polynomials))
+                told = [c.predict(curved[:, k], part.ambient).outside for k, c in enumerate(learned.polynomials)]
+                errors = _rms(part, bare), _rms(part, curved)
+                cases.append(Case(name, train_h, where, *errors, float(np.mean(told)), learned, fit.named()["std"]))
     return cases
 
 
