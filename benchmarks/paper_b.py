@@ -191,9 +191,9 @@ def measured_section(folder: Path) -> str:
     text = title + _table(header, rows)
     text += (
         "\nOpen loop, errors of blocks 1 / 2 / 3. Outside is the share of the test at which a curve meets a temperature, of"
-        " its block or of the room, that it was not learned over; its heat is held there and the prediction says so. The Bayes factor weighs the curves against a latent force that does not"
-        " repeat with temperature; the last column is the standard deviation of the heat that the curve leaves, as a"
-        " share of the latent force's own.\n\n"
+        " its block or of the room, that it was not learned over; its heat is held there and the prediction says so. The"
+        " Bayes factor weighs the curves against a latent force that does not repeat with temperature; the last column is the"
+        " standard deviation of the heat that the curve leaves, as a share of the latent force's own.\n\n"
     )
     return text + _identifiability(rig)
 
