@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 
-.PHONY: demo test test-fast check bench bench-paper-b serve clean
+.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -34,6 +34,9 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
+
+bench-paper-a: $(STAMP)
+	$(BIN)/python -m benchmarks.paper_a
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b

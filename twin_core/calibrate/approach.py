@@ -18,8 +18,8 @@ from twin_core.telemetry import Record
 CAUTION = 3.0
 """The misfit is weighed as this many times itself: its samples are not independent of each other."""
 
-MAX_ROUNDS, SETTLED = 6, 0.9
-"""Rounds at most; a round that leaves more than this share of the misfit is the last."""
+MAX_ROUNDS, FINE_ROUNDS, SETTLED = 6, 2, 0.9
+"""Rounds at most, and after a thinned record; a round that leaves more than this share of the misfit is the last."""
 
 MAX_ITERATIONS, TOLERANCE, COARSE_TOLERANCE = 20, 1e-4, 1e-3
 """Of the search within a round; a thinned record is but a start."""
@@ -38,7 +38,13 @@ def misfit_K(problem: Problem, fit: Fit) -> float:
     return float(np.sqrt(max(excess_K2, 0.0)))
 
 
-def approach(problem: Problem, unknowns: FloatArray | None = None, *, tolerance: float = TOLERANCE) -> Optimum:
+def approach(
+    problem: Problem,
+    unknowns: FloatArray | None = None,
+    *,
+    tolerance: float = TOLERANCE,
+    rounds: int = MAX_ROUNDS,
+) -> Optimum:
     """Return an optimum in which noise and misfit are weighed together.
 
     Parameters
@@ -49,6 +55,8 @@ def approach(problem: Problem, unknowns: FloatArray | None = None, *, tolerance:
         Where to start; the problem's own start by default.
     tolerance
         A round ends when a step lowers the cost by less than this share.
+    rounds
+        Rounds at most.
 
     Returns
     -------
@@ -62,7 +70,7 @@ def approach(problem: Problem, unknowns: FloatArray | None = None, *, tolerance:
     if not np.isfinite(fit.cost):
         return best
     iterations, before = 0, misfit_K(problem, fit)
-    for _ in range(MAX_ROUNDS):
+    for _ in range(rounds):
         noise = np.hypot(problem.noise_K, CAUTION * before)
         weighed = replace(problem, noise_K=noise)
         best = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance)

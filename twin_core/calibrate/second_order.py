@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
-from twin_core.calibrate.approach import COARSE_TOLERANCE, TOLERANCE, approach, coarse_problem
+from twin_core.calibrate.approach import COARSE_TOLERANCE, FINE_ROUNDS, TOLERANCE, approach, coarse_problem
 from twin_core.calibrate.identifiability import words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
@@ -184,7 +184,7 @@ def fit_trajectories(
     progress(0.6, "fitting all samples")
     best = min(found, key=lambda o: coarse.solve(o.unknowns, o.fit).cost)
     if coarse is not problem and best.status != "no_solution":
-        fine = approach(problem, best.unknowns)
+        fine = approach(problem, best.unknowns, rounds=FINE_ROUNDS)
         best = replace(fine, iterations=best.iterations + fine.iterations)
     if best.status == "no_solution":
         raise ModelError(f"calibration failed: {ADVICE[best.status]}")

@@ -1,0 +1,144 @@
+"""Rollouts beside torchdiffeq and SciPy; how their cost grows with samples, nodes and conductors, and their memory."""
+
+import resource
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.integrate import solve_ivp
+from torchdiffeq import odeint
+
+from benchmarks.markdown import markdown_table
+from benchmarks.paper_a_cases import simulations
+from benchmarks.paper_a_speed import seconds
+from twin_core._typing import FloatArray
+from twin_core.calibrate.neural_ode import Recipe, Trainer
+from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.calibrate.windows import balance_of, cut_windows
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
+from twin_core.fem.paper import ORBIT_S, paper_spec
+from twin_core.network.model import build_network
+from twin_core.network.spec import load_spec
+from twin_core.simulate.rollout import rollout
+from twin_core.telemetry import Record
+
+TOLERANCES = tuple(10.0**-n for n in range(4, 13))
+"""Relative and absolute (K) tolerances that the adaptive solvers are given, until they are as accurate as ours."""
+
+
+def rollouts() -> str:
+    """Return one orbit of nine nodes beside torchdiffeq and SciPy, each at the first tolerance that is as accurate."""
+    record = simulations()["combined", "A"].record.between(0.0, ORBIT_S + 1.0)
+    problem = build_problem(build_network(paper_spec()), [record], np.full(9, 0.1), np.inf)
+    network, segment = problem.network, problem.segments[0]
+    start, values = segment.start_prior_K, network.parameters.values
+    matrix, rate = _field(problem)
+    times = np.arange(segment.forcing.n_steps + 1, dtype=np.float64)
+    exact = solve_ivp(rate, (0.0, times[-1]), start, "DOP853", times, rtol=1e-11, atol=1e-9, max_step=0.5).y.T
+    ours = rollout(network, values, start, segment.forcing).at_samples(segment.forcing.sample_step)
+    limit = float(np.abs(ours - exact).max())
+    ours_s = seconds(lambda: rollout(network, values, start, segment.forcing), 30)
+    rows = [["ours (SDIRK2, a step a sample)", f"{1e3 * ours_s:.2f}", f"{limit:.1e}", ""]]
+    field = Trainer(problem, Recipe(window_s=1e9, validation_share=0.0)).field.at(torch.as_tensor(matrix))
+
+    def scipy_path(method: str, rtol: float) -> FloatArray:
+        return solve_ivp(rate, (0.0, times[-1]), start, method, times, rtol=rtol, atol=rtol).y.T
+
+    at, first = torch.as_tensor(times), torch.as_tensor(start)[None]
+    with torch.no_grad():
+        for name, solve in (
+            (
+                "torchdiffeq dopri5",
+                lambda r: odeint(field, first, at, rtol=r, atol=r, method="dopri5")[:, 0].numpy(),
+            ),
+            ("SciPy solve_ivp RK45", lambda r: scipy_path("RK45", r)),
+            ("SciPy solve_ivp LSODA", lambda r: scipy_path("LSODA", r)),
+        ):
+            for rtol in TOLERANCES:
+                error = float(np.abs(solve(rtol) - exact).max())
+                if error <= limit:
+                    break
+            theirs = seconds(lambda solve=solve, rtol=rtol: solve(rtol), 5)
+            rows.append([f"{name}, rtol {rtol:g}", f"{1e3 * theirs:.1f}", f"{error:.1e}", f"{theirs / ours_s:.0f}"])
+            print(rows[-1], flush=True)
+    header = ["solver", "milliseconds", "largest error (K)", "over ours"]
+    return "## Rollout: one orbit, nine nodes, 300 samples\n\n" + markdown_table(header, rows)
+
+
+def _field(problem: Problem) -> tuple[FloatArray, Callable[[float, FloatArray], FloatArray]]:
+    """Return the matrix of the balance and its rate per sample, in NumPy."""
+    balance = balance_of(problem)
+    values, network = problem.network.parameters.values, problem.network
+    matrix = np.tensordot(values, balance.design, axes=1) / values[network.capacity_index][:, None]
+    window = cut_windows(problem, balance, 1e9, 0.0)
+    given, rise, step = window.given[:, 0], window.rise[:, 0], window.step_s[:, 0]
+
+    def rate(tau: float, temperature_K: FloatArray) -> FloatArray:
+        k = min(int(tau), step.size - 1)
+        z = np.concatenate(
+            [temperature_K, STEFAN_BOLTZMANN_W_PER_M2_K4 * temperature_K**4, given[k] + (tau - k) * rise[k]]
+        )
+        return step[k] * (matrix @ z)
+
+    return matrix, rate
+
+
+def growth() -> str:
+    """Return how the cost of a rollout grows with samples, nodes and conductors, and memory at a million samples."""
+    rows = []
+    record = simulations()["combined", "A"].record
+    network = build_network(paper_spec())
+    for n in (1_000, 10_000, 100_000, 1_000_000):
+        long = _repeated(record, n)
+        problem = build_problem(network, [long], np.full(9, 0.1), np.inf)
+        start, forcing = problem.segments[0].start_prior_K, problem.segments[0].forcing
+        taken = seconds(
+            lambda forcing=forcing, start=start: rollout(network, network.parameters.values, start, forcing), 1
+        )
+        rows.append([f"{n:,} samples, 9 nodes, 28 conductors", f"{taken:.3f}", f"{1e6 * taken / n:.1f}"])
+        print(rows[-1], flush=True)
+    for n_nodes, n_edges in ((25, 250), (50, 500), (100, 1000), (200, 2000)):
+        problem = _random_problem(n_nodes, n_edges, 1000)
+        start, forcing, net = problem.segments[0].start_prior_K, problem.segments[0].forcing, problem.network
+        taken = seconds(lambda p=net, f=forcing, s=start: rollout(p, p.parameters.values, s, f), 2)
+        rows.append(
+            [
+                f"1,000 samples, {n_nodes} nodes, {n_edges} conductors",
+                f"{taken:.3f}",
+                f"{1e6 * taken / (n_nodes + n_edges):.0f}",
+            ]
+        )
+        print(rows[-1], flush=True)
+    header = ["rollout", "seconds", "µs per sample, or per node and conductor"]
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return f"## Growth\n\n{markdown_table(header, rows)}\nPeak memory of this process until here: {peak:.2f} GiB.\n"
+
+
+def _repeated(record: Record, n_times: int) -> Record:
+    """Return a record of any length: its inputs over and over."""
+    index = np.arange(n_times) % record.time_s.size
+    return Record(20.0 * np.arange(n_times), {name: c[index] for name, c in record.values.items()})
+
+
+def _random_problem(n_nodes: int, n_edges: int, n_times: int) -> Problem:
+    """Return a connected random network under a switching load."""
+    rng = np.random.default_rng(n_nodes)
+    pairs = {(i, i + 1) for i in range(n_nodes - 1)}
+    while len(pairs) < n_edges:
+        a, b = sorted(rng.choice(n_nodes, 2, replace=False).tolist())
+        pairs.add((a, b))
+    names = [f"n{i}" for i in range(n_nodes)]
+    one, kelvin = {"conductance_W_per_K": {"guess": 1.0}}, {"kind": "temperature", "unit": "K"}
+    spec = load_spec(
+        {
+            "twin": "random",
+            "channels": {f"T{i}": kelvin for i in range(n_nodes)} | {"Q": {"kind": "power", "unit": "W"}},
+            "nodes": [{"id": n, "sensor": f"T{i}", "capacity_J_per_K": {"guess": 5e3}} for i, n in enumerate(names)],
+            "conductors": [{"between": [names[a], names[b]]} | one for a, b in sorted(pairs)],
+            "loads": [{"channel": "Q", "node": "n0"}],
+        }
+    )
+    time_s = 20.0 * np.arange(n_times)
+    heat = np.repeat(rng.choice([0.0, 50.0], n_times // 10 + 1), 10)[:n_times]
+    values = {f"T{i}": np.full(n_times, 290.0) for i in range(n_nodes)} | {"Q": heat}
+    return build_problem(build_network(spec), [Record(time_s, values)], np.full(n_nodes, 0.1), np.inf)
