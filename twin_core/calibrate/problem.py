@@ -1,6 +1,6 @@
 """What is fitted to what: the trajectories of all segments against their measured temperatures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -209,47 +209,71 @@ class Problem:
         """Return measured minus modelled per segment, (n_samples, n_sensors), NaN where missing."""
         return [s.measured_K - p for s, p in zip(self.segments, fit.predicted_K, strict=True)]
 
-    def jacobian_blocks(self, unknowns: FloatArray, fit: Fit) -> list[FloatArray]:
-        """Return d predicted / d unknowns per segment: (n_samples, n_sensors, n_free + n_nodes).
+    def jacobian_stretches(
+        self, unknowns: FloatArray, fit: Fit, sensors: IntArray | None = None
+    ) -> Iterator[tuple[int, slice, FloatArray]]:
+        """Yield (segment, samples, d predicted / d unknowns) stretch by stretch, so that long records need little memory.
 
-        The columns are the free parameters followed by this segment's own initial temperatures.
+        Parameters
+        ----------
+        unknowns, fit
+            A point of the search.
+        sensors : (n_wanted,)
+            Which sensors; all by default.
+
+        Yields
+        ------
+        int, slice, (n_samples_here, n_wanted, n_free + n_nodes)
+            The columns are the free parameters followed by the segment's own initial temperatures.
         """
         values = self.values(unknowns)
+        wanted = np.arange(self.network.sensor_node.size) if sensors is None else sensors
         starts = np.hstack([np.zeros((self.n_nodes, self.n_free)), np.eye(self.n_nodes)])
-        blocks = []
-        for segment, path in zip(self.segments, fit.trajectories, strict=True):
-            parts = [
-                block
-                for _, block in sensitivities(
-                    self.network, values, segment.forcing, path, starts, self.n_free, self.network.sensor_node
-                )
-            ]
-            blocks.append(self.with_reading_derivatives(values, segment, np.concatenate(parts)))
-        return blocks
+        for i, (segment, path) in enumerate(zip(self.segments, fit.trajectories, strict=True)):
+            observed = self.network.sensor_node[wanted]
+            parts = sensitivities(self.network, values, segment.forcing, path, starts, self.n_free, observed)
+            for samples, block in parts:
+                self._add_reading_derivatives(values, segment.record.time_s, samples, wanted, block)
+                yield i, samples, block
+
+    def jacobian_blocks(self, unknowns: FloatArray, fit: Fit, sensors: IntArray | None = None) -> list[FloatArray]:
+        """Return d predicted / d unknowns per segment: (n_samples, n_wanted, n_free + n_nodes)."""
+        parts: list[list[FloatArray]] = [[] for _ in self.segments]
+        for i, _, block in self.jacobian_stretches(unknowns, fit, sensors):
+            parts[i].append(block)
+        return [np.concatenate(blocks) for blocks in parts]
 
     def with_reading_derivatives(self, values: FloatArray, segment: Segment, block: FloatArray) -> FloatArray:
         """Return sensitivities with the derivatives of sensor faults added, (n_samples, n_sensors, n_columns)."""
+        everything = np.arange(self.network.sensor_node.size)
+        self._add_reading_derivatives(values, segment.record.time_s, slice(None), everything, block)
+        return block
+
+    def _add_reading_derivatives(
+        self, values: FloatArray, time_s: FloatArray, samples: slice, sensors: IntArray, block: FloatArray
+    ) -> None:
+        """Add the derivatives of sensor faults to the sensitivities of some samples and sensors, in place."""
         parameters = self.network.parameters
         position = {int(index): k for k, index in enumerate(parameters.free_index)}
-        at = parameters.at_values(values)
+        at = parameters.at_values(values) if self.network.readings else parameters
         for term in self.network.readings:
             index = self.network.term_index(term)
-            part = term.evaluate(segment.record.clock_s, values[index])
-            for item, series in part.d_values:
-                if int(index[item]) in position:
-                    parameter = at.parameters[int(index[item])]
-                    slope = parameter.transform.slope(parameter.free)
-                    block[:, part.sensor, position[int(index[item])]] += slope * series
-        return block
+            part = term.evaluate(time_s, values[index])
+            for column in np.flatnonzero(sensors == part.sensor):
+                for item, series in part.d_values:
+                    if int(index[item]) in position:
+                        parameter = at.parameters[int(index[item])]
+                        slope = parameter.transform.slope(parameter.free)
+                        block[:, column, position[int(index[item])]] += slope * series[samples]
 
     def normal_equations(self, unknowns: FloatArray, fit: Fit) -> tuple[FloatArray, FloatArray]:
         """Return the Gauss-Newton Hessian (n_unknowns, n_unknowns) and the gradient (n_unknowns,) of the cost."""
         mean, std = self.prior()
         hessian = np.diag(1.0 / std**2)
         gradient = (unknowns - mean) / std**2
-        for i, (block, residual) in enumerate(
-            zip(self.jacobian_blocks(unknowns, fit), self.residuals(fit), strict=True)
-        ):
+        residuals = self.residuals(fit)
+        for i, samples, block in self.jacobian_stretches(unknowns, fit):
+            residual = residuals[i][samples]
             valid = np.isfinite(residual)
             weight = np.broadcast_to(1.0 / self.noise_K, residual.shape)[valid]
             if np.isfinite(self.huber):  # iteratively reweighted least squares

@@ -35,13 +35,11 @@ class Whitener:
         """Log-likelihood of the residuals under the fitted noise, all sensors."""
         return float(sum(model.log_likelihood for model in self.models))
 
-    def whiten(self, columns: FloatArray) -> FloatArray:
-        """Return whitened columns, (n_valid, n_columns), from (n_rows, n_sensors, n_columns)."""
-        parts = []
-        for s, model in enumerate(self.models):
-            whitened, _ = model.whiten(self.time_s, np.ascontiguousarray(columns[:, s]), self.valid[:, s])
-            parts.append(whitened[self.valid[:, s]])
-        return np.concatenate(parts)
+    def whiten(self, sensor: int, columns: FloatArray) -> FloatArray:
+        """Return columns whitened as one sensor's residual, (n_valid, n_columns), from (n_rows, n_columns)."""
+        valid = self.valid[:, sensor]
+        whitened, _ = self.models[sensor].whiten(self.time_s, np.ascontiguousarray(columns), valid)
+        return whitened[valid]
 
 
 def one_axis(problem: Problem) -> FloatArray:

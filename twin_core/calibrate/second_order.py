@@ -39,6 +39,9 @@ HUBER = 1.345
 
 Loss = Literal["squared", "huber"]
 
+LARGEST_JACOBIAN = 2.5e7
+"""Derivatives held at once where the covariance is computed, 200 MB; longer records are gone through sensor by sensor."""
+
 MAX_HALVINGS = 3
 N_STARTS = 4
 
@@ -241,10 +244,17 @@ def _best_start(fit: HeatFit, progress: Progress) -> Optimum:
 
 def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
     """Return the covariance of the unknowns, (n_unknowns, n_unknowns), in the metric of the coloured residual."""
-    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
-    whitened = whitener.whiten(jacobian)
     _, std = problem.prior()
-    hessian = whitened.T @ whitened + np.diag(1.0 / std**2)
+    hessian = np.diag(1.0 / std**2)
+    n_sensors = problem.network.sensor_node.size
+    together = max(1, int(LARGEST_JACOBIAN / (whitener.time_s.size * problem.n_unknowns)))
+    for first in range(0, n_sensors, together):
+        sensors = np.arange(first, min(first + together, n_sensors))
+        blocks = problem.jacobian_blocks(optimum.unknowns, optimum.fit, sensors)
+        jacobian = stacked_jacobian(problem, blocks)
+        for column, sensor in enumerate(sensors):
+            whitened = whitener.whiten(int(sensor), jacobian[:, column])
+            hessian += whitened.T @ whitened
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
     return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
 
