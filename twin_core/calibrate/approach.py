@@ -18,11 +18,11 @@ from twin_core.telemetry import Record
 CAUTION = 3.0
 """The misfit is weighed as this many times itself: its samples are not independent of each other."""
 
-MAX_ROUNDS, FINE_ROUNDS, SETTLED = 6, 2, 0.9
-"""Rounds at most, and after a thinned record; a round that leaves more than this share of the misfit is the last."""
+MAX_ROUNDS, SETTLED = 6, 0.9
+"""Rounds at most; a round that leaves more than this share of the misfit is the last."""
 
-MAX_ITERATIONS, TOLERANCE, COARSE_TOLERANCE = 20, 1e-4, 1e-3
-"""Of the search within a round; a thinned record is but a start."""
+MAX_ITERATIONS, TOLERANCE = 20, 1e-3
+"""Of the search within a round: neighbouring samples share their misfit, so that a cost that falls by less tells nothing."""
 
 COARSE_SAMPLES = 1200
 """Records longer than twice this are thinned to about this many samples for a first approach."""

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
-from twin_core.calibrate.approach import COARSE_TOLERANCE, FINE_ROUNDS, TOLERANCE, approach, coarse_problem
+from twin_core.calibrate.approach import approach, coarse_problem
 from twin_core.calibrate.identifiability import words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
@@ -183,11 +183,11 @@ def fit_trajectories(
     found = []
     for trial, start in enumerate(starts):
         progress(0.1 + 0.5 * trial / len(starts), "fitting trajectories")
-        found.append(approach(coarse, start, tolerance=TOLERANCE if coarse is problem else COARSE_TOLERANCE))
+        found.append(approach(coarse, start))
     progress(0.6, "fitting all samples")
     best = min(found, key=lambda o: coarse.solve(o.unknowns, o.fit).cost)
     if coarse is not problem and best.status != "no_solution":
-        fine = approach(problem, best.unknowns, rounds=FINE_ROUNDS)
+        fine = approach(problem, best.unknowns, rounds=1)
         best = replace(fine, iterations=best.iterations + fine.iterations)
     if best.status == "no_solution":
         raise ModelError(f"calibration failed: {ADVICE[best.status]}")

@@ -36,7 +36,7 @@ def test_a_model_too_coarse_keeps_sensible_parameters() -> None:
     problem = too_coarse()
     guess = problem.network.parameters.values
     direct, approached = minimise(problem), approach(problem)
-    assert misfit_K(problem, approached.fit) < 1.1 * misfit_K(problem, direct.fit)
+    assert misfit_K(problem, approached.fit) < 1.2 * misfit_K(problem, direct.fit)
     assert (problem.values(approached.unknowns) > 1e-2 * guess).all()
     assert (problem.values(direct.unknowns) < 1e-4 * guess).any()
 
