@@ -1,10 +1,15 @@
 """Which parameters the data can see, in numbers and in words."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.network.spec import TwinSpec
 from twin_core.parameters.transforms import Identity, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
+from twin_core.telemetry import Record
 
 UNSEEN_STD = 1.0
 """A positive parameter whose ln is uncertain by more than this (a factor e) is not told by the data."""
@@ -59,3 +64,49 @@ def words(parameters: ParameterSet, covariance: FloatArray) -> list[str]:
     said = [f"the data do not determine {name}; it stays near its guess" for name in unseen_parameters(parameters, std)]
     direction = weakest_direction(parameters, covariance)
     return said + ([direction] if direction else [])
+
+
+def strong_correlations(
+    parameters: ParameterSet, covariance: FloatArray, least: float = 0.9, most: int = 5
+) -> list[dict[str, Any]]:
+    """Return the pairs of free parameters whose estimates are most strongly correlated, the strongest first.
+
+    Parameters
+    ----------
+    parameters
+        The calibrated set.
+    covariance : (n_free, n_free)
+        In the solver's coordinate.
+    least, most
+        Smallest correlation that is told, and how many pairs.
+    """
+    std = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = np.triu(covariance / np.outer(std, std), k=1)
+    first, second = np.nonzero(np.abs(correlation) >= least)
+    strongest = np.argsort(-np.abs(correlation[first, second]))[:most]
+    names = parameters.free_names
+    return [
+        {"parameters": [names[first[k]], names[second[k]]], "correlation": float(correlation[first[k], second[k]])}
+        for k in strongest
+    ]
+
+
+def unseen_nodes(spec: TwinSpec, joined: Sequence[Sequence[str]] = ()) -> list[str]:
+    """Return a statement for every node that no chain of conductors, or of pairs ``joined`` besides, ties to a sensor."""
+    pairs = [set(pair) for pair in (*(c.between for c in spec.conductors), *joined)]
+    nodes = {node.id for node in spec.nodes}
+    seen = {node.id for node in spec.nodes if node.sensors}
+    for _ in nodes:
+        seen |= {end for pair in pairs if pair <= nodes and pair & seen for end in pair}
+    return [f"no sensor sees node '{n.id}': all that is said of it is a guess" for n in spec.nodes if n.id not in seen]
+
+
+def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
+    """Return a statement for every sensor and input that never changes."""
+    said = []
+    for name in (*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)):
+        parts = [r.values[name][np.isfinite(r.values[name])] for r in records if name in r.values]
+        samples = np.concatenate(parts) if parts else np.zeros(0)
+        if samples.size and np.ptp(samples) == 0.0:
+            said.append(f"channel '{name}' never changes: what rests tells nothing of capacities")
+    return said

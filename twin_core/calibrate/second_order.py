@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
-from twin_core.calibrate.identifiability import words
+from twin_core.calibrate.identifiability import resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.noise import sensor_noise_K
@@ -41,6 +41,9 @@ Loss = Literal["squared", "huber"]
 
 LARGEST_JACOBIAN = 2.5e7
 """Derivatives held at once where the covariance is computed, 200 MB; longer records are gone through sensor by sensor."""
+
+READINGS_PER_UNKNOWN = 2
+"""Fewer are refused: any model passes through as many readings as it has unknowns."""
 
 MAX_HALVINGS = 3
 N_STARTS = 4
@@ -101,10 +104,11 @@ def prepare(
     step = 1.5 * sampling_step_s(records)
     problem = build_problem(network, records, noise, step)
     readings = sum(int(segment.valid.sum()) for segment in problem.segments)
-    if readings < problem.n_unknowns:
+    if readings < READINGS_PER_UNKNOWN * problem.n_unknowns:
         raise TelemetryError(
             f"{records[0].name}: {readings} readings cannot tell {problem.n_unknowns} unknowns (parameters and initial"
-            " temperatures); give more telemetry, or values that are known"
+            f" temperatures) and their uncertainty; give at least {READINGS_PER_UNKNOWN * problem.n_unknowns} readings, or"
+            " values that are known"
         )
     problem = problem.with_network(network.with_parameters(balance_start(problem)))
     for _ in range(MAX_HALVINGS):
@@ -281,7 +285,7 @@ def to_model(
         {s: float(m.length_s) for s, m in misfit.items()},
         calibration.max_step_s,
         dict(network.layout.table_knots),
-        _summary(calibration, free, notices),
+        _summary(calibration, effects, free, notices),
     )
 
 
@@ -293,7 +297,9 @@ def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray 
     return effect.learned(covariance[np.ix_(own, own)])
 
 
-def _summary(calibration: Calibration, covariance: FloatArray | None, notices: Sequence[str]) -> Json:
+def _summary(
+    calibration: Calibration, effects: Sequence[Effect], covariance: FloatArray | None, notices: Sequence[str]
+) -> Json:
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
     by_name: dict[str, float] = {}
@@ -321,7 +327,12 @@ def _summary(calibration: Calibration, covariance: FloatArray | None, notices: S
             {"name": p.name, "unit": p.unit, "mean": p.value, "std": by_name.get(p.name), "held": p.frozen}
             for p in network.parameters.parameters
         ],
-        "words": [NO_COVARIANCE] if covariance is None else words(network.parameters, covariance),
+        "words": [
+            *unseen_nodes(network.spec, [e.where["nodes"] for e in effects if "nodes" in e.where]),
+            *resting_channels(network.spec, [s.record for s in problem.segments]),
+            *([NO_COVARIANCE] if covariance is None else words(network.parameters, covariance)),
+        ],
+        "correlations": [] if covariance is None else strong_correlations(network.parameters, covariance),
         "notices": list(dict.fromkeys([*notices, *heard])),
     }
 

@@ -88,7 +88,7 @@ class TleOrbit:
         try:
             from sgp4.api import Satrec
         except ImportError as error:
-            raise SpecError("tle: needs the package sgp4; install it with 'pip install sgp4'") from error
+            raise SpecError("tle: needs the package sgp4; install it with 'pip install thermal-twin[orbit]'") from error
         for number, line in enumerate((self.line_1, self.line_2), start=1):
             _check_line(number, line)
         satellite = Satrec.twoline2rv(self.line_1, self.line_2)

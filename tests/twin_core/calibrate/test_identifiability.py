@@ -2,7 +2,16 @@
 
 import numpy as np
 
-from twin_core.calibrate.identifiability import unseen_parameters, weakest_direction, words
+from tests.helpers import conductive_spec, record_of
+from twin_core.calibrate.identifiability import (
+    resting_channels,
+    strong_correlations,
+    unseen_nodes,
+    unseen_parameters,
+    weakest_direction,
+    words,
+)
+from twin_core.network.spec import load_spec
 from twin_core.parameters.parameter import positive, real
 from twin_core.parameters.vector import ParameterSet
 
@@ -35,3 +44,41 @@ def test_words_are_silent_where_all_is_seen() -> None:
 
 def test_nothing_free_is_nothing_to_say() -> None:
     assert words(ParameterSet(()), np.zeros((0, 0))) == []
+
+
+def test_the_strongest_correlations_come_first() -> None:
+    """Against the cosines of the vectors that the covariance is made of."""
+    c, g, q = np.array([1.0, 0.0, 0.02]), np.array([1.0, 0.02, 0.0]), np.array([-0.95, -0.3, 0.5])
+    rows = np.stack([c, g, q])
+    covariance = rows @ rows.T
+    found = strong_correlations(SET, covariance, least=0.8)
+    sizes = np.linalg.norm(rows, axis=1)
+    expected = {
+        ("C:a", "G"): c @ g / (sizes[0] * sizes[1]),
+        ("G", "Q"): g @ q / (sizes[1] * sizes[2]),
+        ("C:a", "Q"): c @ q / (sizes[0] * sizes[2]),
+    }
+    assert [tuple(row["parameters"]) for row in found] == sorted(expected, key=lambda pair: -abs(expected[pair]))
+    for row in found:
+        assert abs(row["correlation"] - expected[tuple(row["parameters"])]) < 1e-12
+    assert strong_correlations(SET, covariance, least=0.99) == found[:1]
+    assert strong_correlations(SET, np.eye(3)) == []
+
+
+def test_a_node_that_no_chain_ties_to_a_sensor_is_said() -> None:
+    data = conductive_spec(3, [(0, 1), (1, 2)])
+    del data["nodes"][2]["sensor"], data["nodes"][1]["sensor"], data["channels"]["T1"], data["channels"]["T2"]
+    assert unseen_nodes(load_spec(data)) == []  # a chain: both are seen through the first
+    del data["conductors"][1]
+    (said,) = unseen_nodes(load_spec(data))
+    assert "no sensor sees node 'n2'" in said
+    assert unseen_nodes(load_spec(data), [("n2", "n0")]) == []
+
+
+def test_channels_at_rest_are_said() -> None:
+    spec = load_spec(conductive_spec(2, [(0, 1)]))
+    time_s = 60.0 * np.arange(20)
+    record = record_of(time_s, T0=290.0, T1=290.0 + np.sin(time_s))
+    (said,) = resting_channels(spec, [record])
+    assert said.startswith("channel 'T0' never changes")
+    assert resting_channels(spec, [record, record_of(time_s, T0=291.0, T1=290.0)]) == []

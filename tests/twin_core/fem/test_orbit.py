@@ -53,7 +53,7 @@ def test_node_of_a_sun_synchronous_orbit_turns_with_the_sun() -> None:
 
 def test_element_set_agrees_with_its_own_kepler_orbit() -> None:
     """SGP4 gives the station's height and inclination; speed and position obey the vis-viva equation."""
-    pytest.importorskip("sgp4")
+    pytest.importorskip("sgp4", reason="two-line elements need the extra 'orbit'")
     epoch_ns = parse_instant_ns("2008-09-20T12:25:40Z")
     place, speed = TleOrbit(*ISS).state(epoch_ns, np.linspace(0.0, 5400.0, 20))
     radius = np.linalg.norm(place, axis=1)
@@ -67,7 +67,7 @@ def test_element_set_agrees_with_its_own_kepler_orbit() -> None:
 
 def test_a_decayed_or_broken_element_set_is_refused() -> None:
     """A century later the station has decayed: a clear error instead of NaN; so with lines that are no set."""
-    pytest.importorskip("sgp4")
+    pytest.importorskip("sgp4", reason="two-line elements need the extra 'orbit'")
     with pytest.raises(SpecError, match="cannot propagate"):
         TleOrbit(*ISS).state(parse_instant_ns("2108-01-01T00:00:00Z"), np.zeros(2))
     with pytest.raises(SpecError, match="line 1 must have 69 characters"):

@@ -215,6 +215,37 @@ def test_conduction_keeps_heat_and_loses_unevenness(n_nodes: int, seed: int) -> 
     assert (np.diff(unevenness) <= 1e-9 * unevenness[0] + 1e-6).all()
 
 
+@settings(max_examples=15, deadline=None)
+@given(n_nodes=st.integers(1, 6), seed=st.integers(0, 2**32 - 1))
+def test_bounded_heat_keeps_every_rollout_bounded(n_nodes: int, seed: int) -> None:
+    """No node gets hotter than the hottest start or than what radiates the largest heat away, nor colder than space.
+
+    At the hottest node conduction takes heat out, so it rises only where its load exceeds sigma R T^4 (paper A, eqs. 9-11).
+    """
+    rng = np.random.default_rng(seed)
+    edges = [(i, j) for i in range(n_nodes) for j in range(i + 1, n_nodes) if rng.random() < 0.6]
+    area_m2, power_W = rng.uniform(0.1, 1.0), rng.uniform(0.0, 300.0, 120)
+    fields = {
+        "channels": {"Q": {"kind": "power", "unit": "W"}},
+        "boundaries": {"space": {"value_K": 3.0}},
+        "radiators": [
+            {"node": f"n{i}", "emissivity": 1.0, "area_m2": area_m2, "sink": "space"} for i in range(n_nodes)
+        ],
+        "loads": [{"channel": "Q", "node": f"n{i}", "weight": 1.0 / n_nodes} for i in range(n_nodes)],
+    }
+    network = build_network(load_spec(conductive_spec(n_nodes, edges, **fields)))
+    values = network.parameters.values
+    values[network.parameters.free_index] *= np.exp(rng.normal(0.0, 2.0, network.parameters.free_index.size))
+    start = rng.uniform(150.0, 350.0, n_nodes)
+    record = record_of(600.0 * np.arange(120), Q=power_W)
+    forcing = build_forcing(network, record, np.inf)
+    path = rollout(network, values, start, forcing)
+    hottest = max(start.max(), (power_W.max() / n_nodes / (5.670374419e-8 * area_m2)) ** 0.25)
+    assert path.converged
+    assert path.stages_K[:, 1].max() < 1.02 * hottest
+    assert path.stages_K[:, 1].min() > 3.0
+
+
 def test_a_single_node_without_heat_stays() -> None:
     network = build_network(load_spec(conductive_spec(1, [])))
     np.testing.assert_array_equal(states(network, record_of(60.0 * np.arange(5)), np.array([293.0])), 293.0)
