@@ -36,7 +36,7 @@ def measure(
     truth_K : sensor -> (n_steps + 1,)
         True temperature at each sensor.
     paths
-        Realised forcings.
+        Realised forcings, and the power of the thermostats.
     """
     time_s = sample_times(scenario)
     values: dict[str, FloatArray] = {}
@@ -50,6 +50,8 @@ def measure(
     for name, forcing in scenario.forcings.items():
         if forcing.recorded:
             values[name] = _disturb(scenario, name, paths[name](time_s), forcing.noise_std_K, 0.0)
+    for thermostat in scenario.thermostats:
+        values[thermostat.channel] = paths[thermostat.channel](time_s)
     _cut_gaps(scenario, time_s, values)
     return Record(time_s, values, scenario.epoch_ns, scenario.scenario)
 

@@ -26,6 +26,7 @@ from twin_core.fem.parts import (
     Times,
 )
 from twin_core.fem.signals import AnySignal
+from twin_core.fem.thermostat import Thermostat
 from twin_core.network.spec import Channel, Name, Positive, Temperature, read_mapping
 from twin_core.units import parse_instant_ns
 
@@ -56,6 +57,7 @@ class Scenario(Part):
     couplings: tuple[Coupling, ...] = ()
     forcings: dict[Name, Forcing] = Field(default_factory=dict)
     loads: tuple[Load, ...] = ()
+    thermostats: tuple[Thermostat, ...] = ()
     sensors: Annotated[tuple[Sensor, ...], Field(min_length=1)]
     hidden: tuple[AnyHiddenEffect, ...] = ()
 
@@ -81,7 +83,8 @@ class Scenario(Part):
             sensor.channel: Channel(kind="temperature", unit=sensor.unit, noise_std=sensor.noise_std_K or None)
             for sensor in self.sensors
         }
-        return sensors | {name: forcing.channel for name, forcing in self.forcings.items() if forcing.recorded}
+        recorded = {name: forcing.channel for name, forcing in self.forcings.items() if forcing.recorded}
+        return sensors | recorded | {thermostat.channel: thermostat.telemetry for thermostat in self.thermostats}
 
     @property
     def epoch_ns(self) -> int | None:
@@ -166,6 +169,11 @@ class Scenario(Part):
             yield from self._forcing_problem(f"loads[{i}].forcing", load.forcing, "power")
             yield from self._place_problem(f"loads[{i}].place", load.place, ids)
         names = [sensor.channel for sensor in self.sensors]
+        switched = [thermostat.channel for thermostat in self.thermostats]
+        for i, thermostat in enumerate(self.thermostats):
+            yield from _unknown(f"thermostats[{i}].region", thermostat.region, ids, "region")
+            if thermostat.channel in (*names, *forcings, *switched[:i]):
+                yield f"thermostats[{i}].channel: '{thermostat.channel}' is declared twice"
         for i, sensor in enumerate(self.sensors):
             if sensor.channel in names[:i] or sensor.channel in forcings:
                 yield f"sensors[{i}].channel: '{sensor.channel}' is declared twice"

@@ -16,12 +16,13 @@ from twin_core.fem.measure import measure
 from twin_core.fem.scenario import Scenario
 from twin_core.fem.signals import Path
 from twin_core.fem.stepping import SCHEMES, Drive
+from twin_core.fem.thermostat import Switch
 from twin_core.telemetry import Record
 
 _LEAST_J = 1e-3
 """Below this nothing moved: the imbalance of an isolated field at rest is rounding over this, not over nothing."""
 
-_PER_SCENARIO = {"scenario", "seed", "forcings", "hidden", "time"}
+_PER_SCENARIO = {"scenario", "seed", "forcings", "thermostats", "hidden", "time"}
 """Fields in which scenarios that share a field may differ (of time: only jitter, gaps and missing samples)."""
 
 
@@ -88,11 +89,18 @@ def simulate_many(scenarios: Sequence[Scenario], progress: Progress = no_progres
         drive_scenario(scenario, clock, path, scheme_class.stage_fractions, scheme_class.input_weights)
         for scenario, path in zip(scenarios, paths, strict=True)
     ]
-    history = _run(field, clock, scenarios, drivings, progress)
+    switches = [_switches(scenario, field) for scenario in scenarios]
+    history = _run(field, clock, scenarios, drivings, switches, progress)
+    for path, working in zip(paths, switches, strict=True):
+        path.update({switch.thermostat.channel: switch.path(clock.start_s) for switch in working})
     return [
         _finish(scenario, field, clock, path, driving, history, case)
         for case, (scenario, path, driving) in enumerate(zip(scenarios, paths, drivings, strict=True))
     ]
+
+
+def _switches(scenario: Scenario, field: Field) -> list[Switch]:
+    return [Switch(item, field.share[item.region], scenario.time.sample_s) for item in scenario.thermostats]
 
 
 def _check_shared(scenarios: Sequence[Scenario]) -> None:
@@ -127,13 +135,18 @@ class _History:
 
 
 def _run(
-    field: Field, clock: Clock, scenarios: Sequence[Scenario], drivings: Sequence[Driving], progress: Progress
+    field: Field,
+    clock: Clock,
+    scenarios: Sequence[Scenario],
+    drivings: Sequence[Driving],
+    switches: Sequence[Sequence[Switch]],
+    progress: Progress,
 ) -> _History:
     """Step all cases through the whole clock."""
     n_cases, n_steps = len(scenarios), clock.start_s.size
     temperature_K = np.repeat(field.start_K[:, None], n_cases, axis=1)
     scheme = SCHEMES[scenarios[0].time.scheme](field, clock.step_s, field.start_K)
-    hidden = _Hidden(field, scenarios, drivings)
+    hidden = _Hidden(field, scenarios, drivings, switches)
     means = np.stack(list(field.share.values()))
     weight = field.capacity_matrix.sum(axis=0)
     history = _History(
@@ -162,15 +175,22 @@ def _run(
 
 
 class _Hidden:
-    """The hidden heat of all cases, evaluated at the stages of one step."""
+    """The heat of hidden effects and of thermostats in all cases, evaluated at the stages of one step."""
 
-    def __init__(self, field: Field, scenarios: Sequence[Scenario], drivings: Sequence[Driving]) -> None:
+    def __init__(
+        self,
+        field: Field,
+        scenarios: Sequence[Scenario],
+        drivings: Sequence[Driving],
+        switches: Sequence[Sequence[Switch]],
+    ) -> None:
         self._field, self._scenarios, self._drivings = field, scenarios, drivings
         bound = [[effect.bind(field) for effect in scenario.hidden] for scenario in scenarios]
         self._bound: list[list[Bound]] = [[item for item in case if item is not None] for case in bound]
         self._last_W = np.zeros((field.n_unknowns, len(scenarios)))
         self._step = 0
-        self.any = any(self._bound)
+        self._switches = switches
+        self.any = any(self._bound) or any(switches)
 
     def begin(self, step: int, time_s: float, temperature_K: FloatArray) -> None:
         """Let effects with a memory look at the start of a step."""
@@ -179,15 +199,20 @@ class _Hidden:
         for case, effects in enumerate(self._bound):
             for effect in effects:
                 effect.advance(self._moment(case, 0, time_s, temperature_K, rest))
+            for switch in self._switches[case]:
+                switch.look(time_s, temperature_K[:, case])
 
     def heat_W(self, time_s: float, temperature_K: FloatArray, rate_K_per_s: FloatArray, stage: int) -> FloatArray:
-        """Return the heat of all hidden effects, (n_unknowns, n_cases)."""
+        """Return the heat of all hidden effects and thermostats, (n_unknowns, n_cases)."""
         heat = np.zeros_like(temperature_K)
         for case, effects in enumerate(self._bound):
             if effects:
                 moment = self._moment(case, stage, time_s, temperature_K, rate_K_per_s)
                 heat[:, case] = sum(effect.heat_W(moment) for effect in effects)
-        self._last_W = heat
+        self._last_W = heat.copy()
+        for case, working in enumerate(self._switches):
+            for switch in working:
+                heat[:, case] += switch.heat_W
         return heat
 
     def by_region_W(self) -> FloatArray:
