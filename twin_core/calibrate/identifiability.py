@@ -14,6 +14,12 @@ from twin_core.telemetry import Record
 UNSEEN_STD = 1.0
 """A positive parameter whose ln is uncertain by more than this (a factor e) is not told by the data."""
 
+LITTLE_LEARNED = 0.9
+"""Nor is one whose uncertainty the data have reduced to no less than this share of its guess's."""
+
+IDENTIFIED_STD = 1.0 / 3.0
+"""A parameter whose relative standard deviation is below this is identified: signal-to-noise ratio of at least 3."""
+
 
 def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     """Return names of free parameters that the data cannot see.
@@ -34,10 +40,27 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     names = []
     for position, index in enumerate(parameters.free_index):
         parameter = parameters.parameters[index]
-        limit = abs(parameter.value) if isinstance(parameter.transform, Identity) else UNSEEN_STD
+        prior = np.inf if parameter.prior_std is None else LITTLE_LEARNED * parameter.prior_std
+        limit = abs(parameter.value) if isinstance(parameter.transform, Identity) else min(UNSEEN_STD, prior)
         if not std[position] < max(limit, 1e-12):
             names.append(parameter.name)
     return names
+
+
+def identified(parameters: ParameterSet, std: FloatArray) -> dict[str, bool]:
+    """Return for each free parameter whether the data tell it to a third of its value or better.
+
+    Parameters
+    ----------
+    parameters
+        The calibrated set.
+    std : (n_free,)
+        Posterior standard deviations in the solver's coordinate.
+    """
+    slopes = parameters.slopes(parameters.free)
+    sizes = np.abs(parameters.values[parameters.free_index])
+    told = std * slopes < IDENTIFIED_STD * np.maximum(sizes, 1e-300)
+    return dict(zip(parameters.free_names, told.tolist(), strict=True))
 
 
 def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
-from twin_core.calibrate.identifiability import resting_channels, strong_correlations, unseen_nodes, words
+from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.noise import sensor_noise_K
@@ -303,10 +303,12 @@ def _summary(
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
     by_name: dict[str, float] = {}
+    told: dict[str, bool] = {}
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
-        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * slopes
-        by_name = dict(zip(network.parameters.free_names, stds.tolist(), strict=True))
+        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        by_name = dict(zip(network.parameters.free_names, (stds * slopes).tolist(), strict=True))
+        told = identified(network.parameters, stds)
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
@@ -324,7 +326,14 @@ def _summary(
         "residual_whiteness": residual_whiteness(calibration.residuals),
         "criteria": acceptance(network.spec, fit["per_sensor"]),
         "parameters": [
-            {"name": p.name, "unit": p.unit, "mean": p.value, "std": by_name.get(p.name), "held": p.frozen}
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "mean": p.value,
+                "std": by_name.get(p.name),
+                "identified": told.get(p.name),
+                "held": p.frozen,
+            }
             for p in network.parameters.parameters
         ],
         "words": [

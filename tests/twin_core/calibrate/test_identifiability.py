@@ -4,6 +4,7 @@ import numpy as np
 
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.identifiability import (
+    identified,
     resting_channels,
     strong_correlations,
     unseen_nodes,
@@ -22,8 +23,15 @@ SET = ParameterSet(
 
 def test_a_factor_e_of_uncertainty_is_not_seen() -> None:
     assert unseen_parameters(SET, np.array([0.1, 0.2, 1.0])) == []
+    assert unseen_parameters(SET, np.array([0.95, 0.2, 1.0])) == ["C:a"]  # its guess alone gives 1
     assert unseen_parameters(SET, np.array([1.1, 0.2, 1.0])) == ["C:a"]
     assert unseen_parameters(SET, np.array([0.1, np.nan, 6.0])) == ["G", "Q"]
+
+
+def test_identified_is_a_third_of_the_value() -> None:
+    """C and G by the standard deviation of their ln; Q, of 5 W, by its own."""
+    assert identified(SET, np.array([0.3, 0.4, 1.6])) == {"C:a": True, "G": False, "Q": True}
+    assert identified(SET, np.array([0.34, 0.1, 1.7])) == {"C:a": False, "G": True, "Q": False}
 
 
 def test_a_ratio_that_alone_is_told_is_said() -> None:
