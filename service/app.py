@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import AsyncIterator
+from typing import Any
 
 from fastapi import FastAPI
 
@@ -65,6 +66,19 @@ async def _running(
         await live_state.close()
 
 
+def _describe_access(app: FastAPI) -> None:
+    """Let the description of the API say that a key is sent as a bearer token, so that its page can ask for one."""
+    describe = app.openapi
+
+    def described() -> dict[str, Any]:
+        document = describe()
+        document.setdefault("components", {})["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer"}}
+        document["security"] = [{}, {"key": []}]
+        return document
+
+    app.openapi = described  # type: ignore[method-assign]
+
+
 def create_app(
     settings: Settings | None = None,
     database: Database | None = None,
@@ -99,6 +113,7 @@ def create_app(
         description="A digital twin of a spacecraft's temperatures that knows what it does not know.",
     )
     problems.install(app)
+    _describe_access(app)
     for router in ROUTERS:
         app.include_router(router)
     for path, files in dashboard.assets().items():

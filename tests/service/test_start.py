@@ -31,6 +31,7 @@ def test_openapi_describes_every_answer(client) -> None:
         for method, operation in methods.items():
             assert operation.get("summary"), (path, method)
     assert client.get("/docs").status_code == 200
+    assert document["components"]["securitySchemes"]["key"]["scheme"] == "bearer"
 
 
 def test_the_dashboard_is_served_whole(client) -> None:

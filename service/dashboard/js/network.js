@@ -12,13 +12,16 @@ const draw = (tag, attributes, text) => {
   return element;
 };
 
-// Stress majorisation (Gansner, Koren, North 2004): drawn distances follow the number of links between two places.
+// Stress majorisation (Gansner, Koren, North 2004): drawn distances follow the links between two places. Radiators are
+// drawn longer, so that the sink which all of them share comes to lie beside the conductors and not on top of them.
+const LENGTH = { radiator: 1.6 };
+
 function layout(names, links) {
   const n = names.length, index = new Map(names.map((name, i) => [name, i]));
   const far = Array.from({ length: n }, (_, i) => Array.from({ length: n }, (_, j) => (i === j ? 0 : Infinity)));
-  for (const [a, b] of links) {
+  for (const { ends: [a, b], kind } of links) {
     const i = index.get(a), j = index.get(b);
-    if (i !== undefined && j !== undefined && i !== j) far[i][j] = far[j][i] = 1;
+    if (i !== undefined && j !== undefined && i !== j) far[i][j] = far[j][i] = Math.min(far[i][j], LENGTH[kind] || 1);
   }
   for (let k = 0; k < n; k++) for (let i = 0; i < n; i++) for (let j = 0; j < n; j++) far[i][j] = Math.min(far[i][j], far[i][k] + far[k][j]);
   const spots = names.map((_, i) => [Math.cos((2 * Math.PI * i) / n) * n * 0.4, Math.sin((2 * Math.PI * i) / n) * n * 0.25]);
@@ -77,16 +80,18 @@ export class NetworkDrawing {
   constructor(host) {
     this.host = host;
     this.key = null;
+    new ResizeObserver(() => this.last && this.update(...this.last)).observe(host);
   }
 
   // picture: {nodes: [{id, temperature_K, heat_W, sensed}], boundaries, links, loads, effects}; temperatures may be null.
   update(picture, unit) {
+    this.last = [picture, unit];
     const names = [...picture.nodes, ...picture.boundaries].map((p) => p.id);
     const narrow = this.host.clientWidth < 620;
     [WIDTH, HEIGHT] = narrow ? [480, 520] : [900, 430];
     const key = JSON.stringify([narrow, names, picture.links.map((l) => l.ends)]);
     if (key !== this.key) {
-      this.places = spread(layout(names, picture.links.map((l) => l.ends)));
+      this.places = spread(layout(names, picture.links));
       this.key = key;
     }
     const svg = draw("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": describe(picture, unit) });
