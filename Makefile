@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 
-.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b serve clean
+.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -37,6 +37,12 @@ bench: $(STAMP)
 
 bench-paper-a: $(STAMP)
 	$(BIN)/python -m benchmarks.paper_a
+
+bench-service: $(STAMP)
+	$(BIN)/python -m benchmarks.service
+	$(BIN)/python -m benchmarks.service_life
+	$(BIN)/python -m benchmarks.anomaly_events
+	$(BIN)/python -m benchmarks.forecast_coverage
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b

@@ -1,0 +1,88 @@
+"""The operator's guide, carried out: its requests and its Python run against a real server."""
+
+import json
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.client import TwinClient
+from tests.service.harness import AppClient
+from tests.service.server import Server
+from tests.service.test_end_to_end import simulate
+
+DOCS = Path(__file__).parents[2] / "docs"
+GUIDE = (DOCS / "operating.md").read_text()
+
+
+def requests() -> list[tuple[str, str, Any]]:
+    """Return method, path and body of every curl line of the guide, in their order."""
+    found = []
+    for block in re.findall(r"^```sh\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL):
+        for text in re.split(r"^(?=curl)", block, flags=re.MULTILINE)[1:]:
+            path = re.search(r"http://127\.0\.0\.1:8000(\S+)", text)
+            body = re.search(r"-d '(.*?)'", text, re.DOTALL)
+            assert path is not None
+            method = "POST" if body or "-X POST" in text else "GET"
+            found.append((method, path[1], json.loads(body[1]) if body else None))
+    return found
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    with Server(tmp_path) as running:
+        yield running
+
+
+def telemetry() -> dict[str, list[float]]:
+    truth = simulate()
+    columns = {"T_a": truth["T_a"], "T_b": truth["T_b"], "Q_a": truth["Q"]}
+    return {name: np.round(column[:121], 4).tolist() for name, column in columns.items()}
+
+
+def finish(client: TwinClient) -> None:
+    """Wait for every calibration."""
+    while not all(job["finished"] for job in client._http.get("/v1/twins/pair/calibrations").json()["jobs"]):
+        time.sleep(0.1)
+
+
+@pytest.mark.e2e
+@pytest.mark.slow
+def test_the_guide_runs(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
+    sent, columns = requests(), telemetry()
+    assert len(sent) >= 9 and sent[0][1] == "/v1/twins"
+    client, begin_s = server.client(), 1772323200.0 - 7200.0  # the guide's own sample comes last
+    for method, path, body in sent:
+        if path == "/v1/twins/pair/calibrations" and method == "POST":
+            client.ingest("pair", [begin_s + 60.0 * k for k in range(120)], {n: c[:120] for n, c in columns.items()})
+        if path.endswith("/activate"):
+            finish(client)
+        if body is not None and "plan" in body:
+            body["plan"]["time"] = [begin_s + 7260.0, begin_s + 8000.0]  # noon is too far for two hours of archive
+        if path.endswith("/events"):
+            assert next(client.events("pair", after_seq=0)).seq >= 1
+            continue
+        response = client._http.request(method, path, json=body)
+        assert response.is_success, (path, response.text)
+    (program,) = re.findall(r"^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+    names = {
+        "specification": sent[0][2],
+        "times": [begin_s + 7260.0],
+        "values": {name: column[120:] for name, column in columns.items()},
+    }
+    exec(compile(program.replace("http://127.0.0.1:8000", server.url), "operating.md", "exec"), names)
+    printed = capsys.readouterr().out
+    assert "version 2 is" in printed and " K" in printed
+
+
+def test_every_metric_of_the_manual_exists(client: AppClient) -> None:
+    client.get("/healthz")
+    text = client.get("/metrics").text
+    named = set(re.findall(r"`?\b(twin_[a-z_]+?)(?:_total)?\b[`{\[ ]", GUIDE + (DOCS / "deployment.md").read_text()))
+    assert len(named) >= 4
+    for name in named:
+        assert f"# TYPE {name}" in text or f"# TYPE {name}_total" in text, name
