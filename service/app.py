@@ -28,9 +28,9 @@ from service.workbench import Workbench
 log = logging.getLogger("service")
 
 ROUTERS = (
+    telemetry.router,  # first: routes are looked up in this order, and this one is asked for most
     health.router,
     twins.router,
-    telemetry.router,
     jobs.calibrations,
     jobs.diagnoses,
     models.router,

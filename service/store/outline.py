@@ -11,7 +11,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.downsample import extremes
 from service.store.merge import collapse
 
 Table = Literal["chunk", "residual"]
@@ -43,7 +42,7 @@ def put(
     if time_us.size < PIECE:
         return
     time_us, values = collapse(time_us, values)
-    kept = extremes(values, 2 + 2 * values.shape[0] * (time_us.size // PIECE))
+    kept = _extremes(values)
     connection.execute(
         f"INSERT INTO {table}_outline (chunk, instants, time, value) VALUES (?, ?, ?, ?)",
         (
@@ -53,6 +52,22 @@ def put(
             np.ascontiguousarray(values[:, kept], dtype="<f8").data,
         ),
     )
+
+
+def _extremes(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return where any row has its least or greatest value within each piece, and the ends, in order."""
+    n_rows, n_times = values.shape
+    n_whole = n_times - n_times % PIECE
+    kept = [np.array([0, n_times - 1])]
+    for first, length in ((0, PIECE), (n_whole, max(n_times - n_whole, 1))):
+        stop = n_whole if first == 0 else n_times
+        pieces = values[:, first:stop].reshape(n_rows, -1, length)
+        if pieces.size:
+            begin = first + length * np.arange(pieces.shape[1])
+            missing = np.isnan(pieces)
+            kept.append((begin + np.where(missing, np.inf, pieces).argmin(axis=2)).ravel())
+            kept.append((begin + np.where(missing, -np.inf, pieces).argmax(axis=2)).ravel())
+    return np.unique(np.concatenate(kept))
 
 
 def parts(
