@@ -1,6 +1,8 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,6 +35,9 @@ LATENT_SHARES = (1.0, 0.1, 0.01)
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
 N_SETTLED = 4
+SETTLING_NATS = 40.0
+"""Options this far behind after a few passes are not fitted further."""
+
 N_VALIDATED = 3
 ALTERNATIVE_NATS = 3.0
 VALIDATION_GAIN = 0.97
@@ -243,9 +248,13 @@ def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) ->
 
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
     """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
-    judged = sorted((_judge(state, state.trial, option, n_tried, n_passes=3) for option in options), key=_worth)
-    near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > judged[0].evidence.log_bayes_factor - 40.0]
-    return [*(_judge(state, j.trial, j.effects, n_tried, n_passes=15) for j in near), *judged[len(near) :]]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
+        quick = pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3), options)
+        judged = sorted(quick, key=_worth)
+        best = judged[0].evidence.log_bayes_factor if judged else 0.0
+        near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
+        settled = pool.map(lambda j: _judge(state, j.trial, j.effects, n_tried, n_passes=15), near)
+        return [*settled, *judged[len(near) :]]
 
 
 def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:

@@ -11,7 +11,7 @@ from numba import njit
 from twin_core._typing import BoolArray, FloatArray, IntArray
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_covariance(
     full: FloatArray, cov: FloatArray, turned: FloatArray, keep: float, force: FloatArray, state: FloatArray
 ) -> None:
@@ -42,7 +42,7 @@ def _predict_covariance(
         cov[n + i, n + i] += force[i] * (1.0 - keep * keep)
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_columns(full: FloatArray, mean: FloatArray, work: FloatArray, keep: float) -> None:
     """Advance the mean of every column."""
     both, n_columns = mean.shape
@@ -61,7 +61,7 @@ def _predict_columns(full: FloatArray, mean: FloatArray, work: FloatArray, keep:
             mean[n + i, c] *= keep
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _condition(
     o: int, noise: float, cov: FloatArray, mean: FloatArray, reading: FloatArray, out: FloatArray, gain: FloatArray
 ) -> float:
@@ -84,7 +84,7 @@ def _condition(
     return variance
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def whiten_columns(
     transition: FloatArray,
     response: FloatArray,
@@ -149,7 +149,7 @@ def whiten_columns(
     return out, log_det
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def affine_march(transition: FloatArray, offset: FloatArray, start: FloatArray) -> FloatArray:
     """Return the states of x[k+1] = A[k] x[k] + b[k], (n_steps + 1, n), from ``start`` (n,)."""
     n_steps, n = offset.shape

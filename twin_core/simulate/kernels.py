@@ -17,7 +17,7 @@ from twin_core._typing import FloatArray, IntArray
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _factorise(matrix: FloatArray, pivots: IntArray) -> None:
     """Replace a square matrix by its LU factors with partial pivoting."""
     n = matrix.shape[0]
@@ -38,7 +38,7 @@ def _factorise(matrix: FloatArray, pivots: IntArray) -> None:
                     matrix[i, j] -= factor * matrix[k, j]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _solve_columns(lu: FloatArray, pivots: IntArray, columns: FloatArray) -> None:
     """Solve in place for every column of (n, n_columns)."""
     n, n_columns = columns.shape
@@ -64,7 +64,7 @@ def _solve_columns(lu: FloatArray, pivots: IntArray, columns: FloatArray) -> Non
             columns[i, c] *= inverse
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _prepare(lu: FloatArray, pivots: IntArray, scaled_step: float, jacobian: FloatArray) -> None:
     """Factorise I - gamma h J."""
     n = jacobian.shape[0]
@@ -75,7 +75,7 @@ def _prepare(lu: FloatArray, pivots: IntArray, scaled_step: float, jacobian: Flo
     _factorise(lu, pivots)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def march(
     step_s: FloatArray, jacobian: FloatArray, constant: FloatArray, start: FloatArray, gamma: float
 ) -> FloatArray:
@@ -118,7 +118,7 @@ def march(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def march_sensitivities(
     step_s: FloatArray,
     jacobian: FloatArray,
