@@ -4,7 +4,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.discover.confirm import Trial
-from twin_core.discover.search import Search
+from twin_core.discover.judge import Search
 from twin_core.effects.base import Effect
 from twin_core.network.dynamics import fill_boundaries
 

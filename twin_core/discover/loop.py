@@ -12,10 +12,11 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, fit_network, to_model
 from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
+from twin_core.discover.judge import Search
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
-from twin_core.discover.search import Search, search
+from twin_core.discover.search import search
 from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec

@@ -8,7 +8,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.discover.holdout import HeldOut, Prediction
-from twin_core.discover.search import Search
+from twin_core.discover.judge import Search
 from twin_core.discover.witness import NodeHeat, Witness
 from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.telemetry import Record

@@ -10,7 +10,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import acceptance
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.discover.holdout import HeldOut, Prediction
-from twin_core.discover.search import Finding, Judged, Search
+from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
 

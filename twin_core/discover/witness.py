@@ -13,7 +13,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, floor_K2
 from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
-from twin_core.discover.search import Search
+from twin_core.discover.judge import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
 from twin_core.gp.polynomial import ForcePolynomial

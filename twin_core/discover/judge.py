@@ -1,0 +1,125 @@
+"""Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from twin_core.discover.confirm import Evidence, Trial, Validation, validate
+from twin_core.effects.base import Effect
+
+N_VALIDATED = 3
+ALTERNATIVE_NATS = 3.0
+VALIDATION_GAIN = 0.97
+"""An effect must lower the error on blocks that it was not fitted to by 3 % at least, or it is not worth its name."""
+
+FORWARD_LIMIT = 1.02
+"""Nor may it make the end of the training record worse when it is fitted to the beginning alone."""
+
+DECISIVE, TOLERATED = 0.7, 1.7
+"""Where one event tells all, either measure may see little of it: an effect that lowers the one by 30 % may raise the
+other by as much as an event that it has not seen costs."""
+
+LUMPING_SHARE = 0.005
+"""What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
+
+EXPLAINED_SHARE = 0.5
+"""An effect must make half of the latent heat's variance superfluous where it acts, or something else is missing there."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A set of effects that was tried on top of a simpler model, and what speaks for it."""
+
+    effects: tuple[Effect, ...]
+    evidence: Evidence
+    trial: Trial
+    validation: Validation | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Effects that the record supports together, and what it cannot tell them from."""
+
+    judged: Judged
+    alternatives: tuple[Judged, ...] = ()
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """The effects, at the values of the trial that found them."""
+        return self.judged.effects
+
+
+@dataclass
+class Search:
+    """The state of a search: the model so far and how it came about; ``n_named`` candidates were tried before a fallback."""
+
+    trial: Trial
+    base: Trial
+    n_named: int = 0
+    findings: list[Finding] = field(default_factory=list)
+    rejected: list[Judged] = field(default_factory=list)
+
+    def count(self, n_looked_at: int, *, fallback: bool) -> int:
+        """Return how many effects and places were tried: a fallback comes after all the named ones."""
+        if fallback:
+            return self.n_named + n_looked_at
+        self.n_named = n_looked_at
+        return n_looked_at
+
+
+def threshold(false_alarm_rate: float) -> float:
+    """Return the log Bayes factor that an effect must reach: the odds of the false-alarm rate."""
+    return float(np.log(1.0 / false_alarm_rate))
+
+
+def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
+    """Keep the best option that passes evidence and validation; False if none does."""
+    judged = simplest_first(once_each(options))
+    failed: list[Judged] = []
+    for best in judged[:N_VALIDATED]:
+        if best.evidence.log_bayes_factor <= needed:
+            continue
+        own = replace(best, validation=validate(state.trial, best.trial))
+        if own.validation is not None and is_valid(own.validation):
+            close = [j for j in judged if j is not best and j not in failed and is_close(j, best)]
+            state.trial = best.trial
+            state.findings.append(Finding(own, tuple(close)))
+            return True
+        failed.append(best)
+        state.rejected.append(own)
+    state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
+    return False
+
+
+def once_each(options: Sequence[Judged]) -> list[Judged]:
+    """Return the options, best first, every set of effects and places once."""
+    best: dict[frozenset[object], Judged] = {}
+    for judged in sorted(options, key=worth):
+        best.setdefault(frozenset(effect.place for effect in judged.effects), judged)
+    return list(best.values())
+
+
+def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
+    """Return options, best first, with the simplest of those in front that the data hardly tell from the best."""
+    close = [j for j in judged if j is judged[0] or is_close(j, judged[0])]
+    rest = [j for j in judged if all(j is not c for c in close)]
+    return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
+
+
+def is_valid(validation: Validation) -> bool:
+    """Return whether an effect helps where it was not fitted, by an amount that a lumped network can judge."""
+    blocks, forward = validation.ratio, validation.forward_ratio
+    both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
+    either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
+    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > EXPLAINED_SHARE
+    return (both or either) and matters
+
+
+def worth(judged: Judged) -> float:
+    return -judged.evidence.log_bayes_factor
+
+
+def is_close(other: Judged, best: Judged) -> bool:
+    """Return whether the data hardly tell another option from the best one."""
+    return other.evidence.log_bayes_factor > best.evidence.log_bayes_factor - ALTERNATIVE_NATS

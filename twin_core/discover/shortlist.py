@@ -1,0 +1,66 @@
+"""The shortlist: every candidate of the registry, screened, and the few that are worth a refit."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from twin_core.calibrate.latent_heat import HeatFit
+from twin_core.discover.confirm import Trial
+from twin_core.discover.screen import Probe, Screening, screen, survey_of
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect, Survey
+
+
+def candidates(trial: Trial, fit: HeatFit, *, fallback: bool) -> tuple[Survey, list[Effect]]:
+    """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks."""
+    survey = survey_of(fit)
+    taken = {effect.place for effect in trial.effects}
+    effects = [
+        effect
+        for kind in REGISTRY.values()
+        if kind.fallback == fallback
+        for where in kind.places(survey.layout)
+        for effect in kind.starts(where, survey)
+        if effect.place not in taken
+    ]
+    return survey, effects
+
+
+def screened(trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: bool) -> list[Screening]:
+    """Screen the candidates of a trial about a fit, once per assumed size of the latent heat.
+
+    As fitted, the latent heat explains everything a little; smaller, it is as it would be with the right effect in place.
+    """
+    survey, effects = candidates(trial, fit, fallback=fallback)
+    sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
+    return [screen(one, survey, effects) for one in sized]
+
+
+def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int) -> list[Effect]:
+    """Return the effects worth a refit: the best of every ranking in turn, each place once."""
+    chosen: dict[object, Effect] = {}
+    for rank in range(n_wanted):
+        for ranked in rankings:
+            if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:
+                chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
+    return list(chosen.values())
+
+
+def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
+    """Return effects at the best of their finer settings, where the first ones are too coarse for a local search."""
+    survey = survey_of(fit)
+    finer = [setting for effect in effects for setting in effect.refined(survey)]
+    best = {probe.effect.place: probe.effect for probe in reversed(screen(fit, survey, finer).probes)}
+    return [best.get(effect.place, effect) for effect in effects]
+
+
+def best_of_each_place(probes: Sequence[Probe], n_samples: int) -> list[Probe]:
+    """Return the best setting of each effect and place, best first, each amplitude paid for by its Schwarz penalty."""
+    penalty = 0.5 * np.log(max(n_samples, 2))
+    best: dict[object, tuple[float, Probe]] = {}
+    for probe in probes:
+        worth = probe.gain - penalty * len(probe.effect.amplitudes)
+        if probe.effect.place not in best or worth > best[probe.effect.place][0]:
+            best[probe.effect.place] = (worth, probe)
+    return [probe for _, probe in sorted(best.values(), key=lambda item: -item[0])]

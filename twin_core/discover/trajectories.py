@@ -1,0 +1,77 @@
+"""The second look, at open-loop trajectories: where misfit is too large for the innovations to lead the way.
+
+Long trajectories forgive effects that merely resemble what is missing, so what they suggest must be supported by the
+innovations too: once, for one set of effects, not for one among many.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import comb
+
+from twin_core.discover.confirm import (
+    Trial,
+    about_trajectory,
+    resettled,
+    try_on_trajectories,
+    weigh,
+    weigh_trajectories,
+)
+from twin_core.discover.judge import N_VALIDATED, Judged, Search, accept, once_each, worth
+from twin_core.discover.shortlist import best_of_each_place, refined, screened, shortlist
+
+SHARES = (1.0, 0.1, 0.01)
+N_REFITS = 6
+MOST_TOGETHER = 3
+"""Effects that are tried together where none helps alone."""
+
+N_KEPT = 4
+"""Sets of effects that are extended by one more."""
+
+
+def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
+    """Add the effect, or the effects that only pay off together, that open-loop residuals suggest; False if none holds.
+
+    Parameters
+    ----------
+    state
+        The model so far; it grows by what is found.
+    needed
+        Log Bayes factor that is asked for.
+    fallback
+        Whether to try the effects without a name.
+    """
+    sets: list[Judged] = []
+    for n_together in range(1, 2 if fallback else MOST_TOGETHER + 1):
+        seeds = [j.trial for j in sets] if sets else [state.trial]
+        judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
+        sets = once_each(judged)[:N_KEPT]
+        state.rejected += sets
+        if accept(state, _supported(state, sets, needed), needed):
+            return True
+        if not sets:
+            break
+    return False
+
+
+def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fallback: bool) -> list[Judged]:
+    """Return what one more effect makes of a trial, judged against the state's model."""
+    calibration = seed.calibration
+    fit = about_trajectory(calibration.problem, calibration.optimum)
+    screenings = screened(seed, fit, SHARES, fallback=fallback)
+    rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
+    n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
+    judged = []
+    for effect in refined(fit, shortlist(rankings, needed, N_REFITS)):
+        trial = try_on_trajectories(seed, (*seed.present_effects, effect))
+        if trial is not None:
+            found = trial.effects[len(state.trial.effects) :]
+            evidence = weigh_trajectories(state.trial, trial, comb(n_tried, n_together))
+            judged.append(Judged(found, evidence, trial))
+    return judged
+
+
+def _supported(state: Search, options: Sequence[Judged], needed: float) -> list[Judged]:
+    """Return the options that the innovations support as well, with their parameters fitted to these."""
+    likely = [j for j in sorted(options, key=worth)[:N_VALIDATED] if j.evidence.log_bayes_factor > needed]
+    settled = [replace(j, trial=resettled(state.trial, j.trial)) for j in likely]
+    return [j for j in settled if weigh(state.trial, j.trial, 1).log_bayes_factor > needed]
