@@ -125,6 +125,8 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     residual = np.concatenate(calibration.residuals) / problem.noise_K
     jacobian = jacobian / problem.noise_K[None, :, None]
     hessian, _ = problem.normal_equations(unknowns, calibration.optimum.fit)
+    told = np.isinf(problem.step_bounds(unknowns)[1])  # an instant is told by one block alone, and seldom moves linearly
+    jacobian, hessian = jacobian[:, :, told], hessian[np.ix_(told, told)]
     edges = np.linspace(0, residual.shape[0], N_BLOCKS + 1).astype(int)
     errors = np.zeros(N_BLOCKS)
     for b, (first, last) in enumerate(pairwise(edges.tolist())):
