@@ -15,7 +15,7 @@ from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration, from_heat_fit
+from twin_core.calibrate.second_order import Calibration, from_heat_fit, gls_covariance
 from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
 
@@ -66,6 +66,14 @@ class Trial:
     def present_effects(self) -> tuple[Effect, ...]:
         """The effects at the values of the open-loop calibration."""
         return fitted_effects(self.effects, self.calibration.network.parameters.as_dict())
+
+    @cached_property
+    def free_std(self) -> dict[str, float]:
+        """Free parameter -> standard deviation in the solver's coordinate, relative for positive ones."""
+        calibration = self.calibration
+        covariance = gls_covariance(calibration.problem, calibration.optimum, calibration.whitener)
+        names = calibration.problem.network.parameters.free_names
+        return dict(zip(names, np.sqrt(np.diag(covariance)[: len(names)]).tolist(), strict=True))
 
     @cached_property
     def block_errors(self) -> FloatArray:
@@ -125,7 +133,9 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     residual = np.concatenate(calibration.residuals) / problem.noise_K
     jacobian = jacobian / problem.noise_K[None, :, None]
     hessian, _ = problem.normal_equations(unknowns, calibration.optimum.fit)
-    told = np.isinf(problem.step_bounds(unknowns)[1])  # an instant is told by one block alone, and seldom moves linearly
+    told = np.isinf(
+        problem.step_bounds(unknowns)[1]
+    )  # an instant is told by one block alone, and seldom moves linearly
     jacobian, hessian = jacobian[:, :, told], hessian[np.ix_(told, told)]
     edges = np.linspace(0, residual.shape[0], N_BLOCKS + 1).astype(int)
     errors = np.zeros(N_BLOCKS)

@@ -23,6 +23,9 @@ other by as much as an event that it has not seen costs."""
 LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
+UNTOLD_STD = 1.0
+"""Relative deviation of a positive parameter beyond which it is not told: a mass of any size is a boundary, not a mass."""
+
 EXPLAINED_SHARE = 0.5
 """An effect must make half of the latent heat's variance superfluous where it acts, or something else is missing there."""
 
@@ -81,7 +84,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         if best.evidence.log_bayes_factor <= needed:
             continue
         own = replace(best, validation=validate(state.trial, best.trial))
-        if own.validation is not None and is_valid(own.validation):
+        if own.validation is not None and is_valid(own.validation, len(own.effects)) and is_told(own):
             close = [j for j in judged if j is not best and j not in failed and is_close(j, best)]
             state.trial = best.trial
             state.findings.append(Finding(own, tuple(close)))
@@ -107,13 +110,22 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
     return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
 
 
-def is_valid(validation: Validation) -> bool:
-    """Return whether an effect helps where it was not fitted, by an amount that a lumped network can judge."""
+def is_told(judged: Judged) -> bool:
+    """Return whether the data tell how large the effects are: no positive parameter is as uncertain as it is large."""
+    positive = [f"{e.label}.{q.name}" for e in judged.effects for q in e.qualities() if q.positive]
+    return all(judged.trial.free_std.get(name, 0.0) < UNTOLD_STD for name in positive)
+
+
+def is_valid(validation: Validation, n_effects: int = 1) -> bool:
+    """Return whether effects help where they were not fitted, by an amount that a lumped network can judge.
+
+    Several at once have more ways to please one measure alone, so they must please both.
+    """
     blocks, forward = validation.ratio, validation.forward_ratio
     both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
     either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
     matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > EXPLAINED_SHARE
-    return (both or either) and matters
+    return (both or (either and n_effects == 1)) and matters
 
 
 def worth(judged: Judged) -> float:

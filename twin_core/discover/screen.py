@@ -5,11 +5,12 @@ whitened in the metric of sensor noise and latent heat, and projected off what t
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
@@ -174,10 +175,13 @@ def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
     (n_rows + n_free, n_basis), (n_rows + n_free,)
         Whitened; the last n_free rows are the priors.
     """
+    return _nuisance(fit, [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals])
+
+
+def _nuisance(fit: HeatFit, blocks: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     parameters = fit.problem.network.parameters
     std = parameters.prior_std
-    columns = _whitened(fit, [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals])
-    design = np.vstack([columns, np.diag(1.0 / std)])
+    design = np.vstack([_whitened(fit, blocks), np.diag(1.0 / std)])
     data = _whitened(fit, [n.residual_K[:, :, None] for n in fit.nominals])[:, 0]
     rows = np.concatenate([data, (parameters.free - fit.free) / std])
     scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
@@ -203,27 +207,50 @@ def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screen
     Screening
         Physically possible probes, best first.
     """
+    return screen_sizes(fit, (1.0,), survey, candidates)[0]
+
+
+def screen_sizes(
+    fit: HeatFit, shares: Sequence[float], survey: Survey, candidates: Iterable[Effect]
+) -> list[Screening]:
+    """Screen candidate effects at several sizes of the latent heat, as shares of the fitted one: see :func:`screen`.
+
+    The responses are the same for all; only their metric changes.
+    """
     effects = list(candidates)
-    all_columns: list[Column] = []
+    columns: list[Column] = []
     owners = []
     for i, effect in enumerate(effects):
         for column in zip(effect.unit_heats(survey), effect.unit_readings(survey), strict=True):
-            all_columns.append(column)
+            columns.append(column)
             owners.append(i)
-    basis, residual = nuisance_basis(fit)
-    if not all_columns:
+    nuisance = [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals]
+    blocks = responses(fit, survey, columns) if columns else []
+    sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
+    return [_screening(one, nuisance, effects, np.array(owners, dtype=np.int64), blocks) for one in sized]
+
+
+def _screening(
+    fit: HeatFit,
+    nuisance: Sequence[FloatArray],
+    effects: Sequence[Effect],
+    owners: IntArray,
+    blocks: Sequence[FloatArray],
+) -> Screening:
+    """Return the probes in the metric of a fit; ``owners`` tells which effect a column of the responses belongs to."""
+    basis, residual = _nuisance(fit, nuisance)
+    if not blocks:
         return Screening((), residual, 0)
-    whitened = _whitened(fit, responses(fit, survey, all_columns))
+    whitened = _whitened(fit, blocks)
     whitened = np.vstack([whitened, np.zeros((residual.size - whitened.shape[0], whitened.shape[1]))])
     projected = whitened - basis @ (basis.T @ whitened)
-    owner, probes = np.array(owners), []
-    for i, effect in enumerate(effects):
-        columns = np.flatnonzero(owner == i)
-        probe = _probe(effect, whitened[:, columns], projected[:, columns], residual)
-        if probe is not None:
-            probes.append(probe)
-    probes.sort(key=lambda p: -p.gain)
-    return Screening(tuple(probes), residual, len(effects))
+    edges = np.searchsorted(owners, np.arange(len(effects) + 1))
+    probes = [
+        _probe(effect, whitened[:, a:b], projected[:, a:b], residual)
+        for effect, (a, b) in zip(effects, pairwise(edges.tolist()), strict=True)
+    ]
+    found = sorted((p for p in probes if p is not None), key=lambda p: -p.gain)
+    return Screening(tuple(found), residual, len(effects))
 
 
 def _probe(effect: Effect, whitened: FloatArray, projected: FloatArray, residual: FloatArray) -> Probe | None:

@@ -1,15 +1,17 @@
 """The shortlist: every candidate of the registry, screened, and the few that are worth a refit."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.discover.confirm import Trial
-from twin_core.discover.screen import Probe, Screening, screen, survey_of
+from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Survey
+
+N_VARIED = 4
+"""Places at the head of the shortlist that are tried from more than one start."""
 
 
 def candidates(trial: Trial, fit: HeatFit, *, fallback: bool) -> tuple[Survey, list[Effect]]:
@@ -33,18 +35,30 @@ def screened(trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: b
     As fitted, the latent heat explains everything a little; smaller, it is as it would be with the right effect in place.
     """
     survey, effects = candidates(trial, fit, fallback=fallback)
-    sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
-    return [screen(one, survey, effects) for one in sized]
+    return screen_sizes(fit, shares, survey, effects)
 
 
 def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int) -> list[Effect]:
-    """Return the effects worth a refit: the best of every ranking in turn, each place once."""
+    """Return the effects worth a refit: the best of every ranking in turn, each place once.
+
+    The first few places are joined by the other settings that the rankings prefer there: a set-point or a time constant
+    is found by a local search, and one start may be caught.
+    """
     chosen: dict[object, Effect] = {}
     for rank in range(n_wanted):
         for ranked in rankings:
             if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:
                 chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
-    return list(chosen.values())
+    varied = list(chosen)[:N_VARIED]
+    starts = {_start(effect): effect for effect in chosen.values()}
+    for probe in (p for ranked in rankings for p in ranked if p.effect.place in varied):
+        starts.setdefault(_start(probe.effect), probe.effect)
+    return list(starts.values())
+
+
+def _start(effect: Effect) -> tuple[object, tuple[float, ...]]:
+    """Return the place and the values that shape the effect without scaling it."""
+    return effect.place, tuple(effect.values[q.name] for q in effect.qualities() if q.null is None)
 
 
 def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
@@ -52,7 +66,7 @@ def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
     survey = survey_of(fit)
     finer = [setting for effect in effects for setting in effect.refined(survey)]
     best = {probe.effect.place: probe.effect for probe in reversed(screen(fit, survey, finer).probes)}
-    return [best.get(effect.place, effect) for effect in effects]
+    return list({_start(e): e for e in (best.get(effect.place, effect) for effect in effects)}.values())
 
 
 def best_of_each_place(probes: Sequence[Probe], n_samples: int) -> list[Probe]:

@@ -21,8 +21,8 @@ from twin_core.discover.shortlist import best_of_each_place, refined, screened, 
 
 SHARES = (1.0, 0.1, 0.01)
 N_REFITS = 6
-MOST_TOGETHER = 3
-"""Effects that are tried together where none helps alone."""
+MOST_TOGETHER = 2
+"""Effects that are tried together where none helps alone: more fit anything on a long trajectory."""
 
 N_KEPT = 4
 """Sets of effects that are extended by one more."""

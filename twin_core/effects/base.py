@@ -135,6 +135,12 @@ class Survey:
         """The first sample, on the clock of ``along``."""
         return float(self.sample_s.min())
 
+    @property
+    def one_clock(self) -> bool:
+        """Whether an instant means one moment: files in their own seconds may all begin at zero."""
+        spans = sorted((self.along.time_s[s][0], self.along.time_s[s][-1]) for s in self.segments())
+        return all(before[1] <= after[0] for before, after in pairwise(spans))
+
     def segments(self) -> Iterable[slice]:
         """Yield the points of each segment."""
         yield from (slice(a, b) for a, b in pairwise(self.segment_edges))

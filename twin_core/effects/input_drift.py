@@ -43,5 +43,5 @@ class InputDrift(Effect):
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the one null effect of a channel that is on at times: it is linear in r."""
-        if np.any(survey.along.inputs.get(where["channel"], 0.0)):
+        if survey.one_clock and np.any(survey.along.inputs.get(where["channel"], 0.0)):
             yield cls(where, {"r_per_s": 0.0}, {"t0_s": survey.begin_s, "dated": survey.dated})

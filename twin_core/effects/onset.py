@@ -51,7 +51,7 @@ class OnsetEffect(Effect):
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield onsets with equal numbers of samples between them, so that none lies in a gap."""
         samples = np.unique(survey.sample_s)
-        if samples.size < 3:
+        if samples.size < 3 or not survey.one_clock:
             return
         begin, span = float(samples[0]), float(samples[-1] - samples[0])
         settings = {"begin_s": begin, "span_s": span, "width_s": float(np.median(np.diff(samples)))}

@@ -52,4 +52,5 @@ class SensorDrift(Effect):
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the one null effect: it is linear in d."""
-        yield cls(where, {"d_K_per_s": 0.0}, {"t0_s": survey.begin_s, "dated": survey.dated})
+        if survey.one_clock:
+            yield cls(where, {"d_K_per_s": 0.0}, {"t0_s": survey.begin_s, "dated": survey.dated})
