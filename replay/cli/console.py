@@ -20,9 +20,10 @@ def progress_bar(title: str) -> Iterator[Progress]:
         yield lambda fraction, message: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.fields[title]}"), BarColumn(), TimeElapsedColumn())
+    times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.fields[title]}"), BarColumn(), *times)
     with Progress(
         *columns, TextColumn("[dim]{task.fields[note]}"), console=Console(stderr=True), transient=True
     ) as bar:

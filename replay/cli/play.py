@@ -1,5 +1,6 @@
 """``twin replay``: streams recordings into a running service."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,6 +103,12 @@ def _send(
         raise ReplayError(f"twin '{twin}': {error}") from error
     mapping = map_topics(list(recording.columns), detail.channels, renames)
     fitting = convert_units(apply_mapping(recording, mapping), load_spec(detail.specification), "the recording")
+    begun_s = time.monotonic()
+
+    def note(tally: "Tally") -> str:
+        rate = tally.sent / max(time.monotonic() - begun_s, 1e-9)
+        return f"{tally.sent:,} of {tally.total:,} samples, {rate:,.0f} per second"
+
     with progress_bar("replaying") as progress:
         return play(
             fitting,
@@ -109,5 +116,5 @@ def _send(
             twin,
             rate=rate,
             resume=resume,
-            progress=lambda tally: progress(tally.sent / max(tally.total, 1), f"{tally.sent} samples"),
+            progress=lambda tally: progress(tally.sent / max(tally.total, 1), note(tally)),
         )
