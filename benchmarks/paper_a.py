@@ -6,10 +6,11 @@
 import argparse
 from collections.abc import Callable
 
-from benchmarks import paper_a_rollout, paper_a_speed, paper_a_stability, paper_a_tables
+from benchmarks import paper_a_memory, paper_a_rollout, paper_a_speed, paper_a_stability, paper_a_tables
 from benchmarks.markdown import save_table
 
 TITLES = {
+    "memory": "Paper A, calibration of a million samples",
     "tables": "Paper A, tables 1 to 3: external, internal and combined forcing",
     "windows": "Paper A, table 4: window length",
     "noise": "Paper A, table 5: noise on the labels",
@@ -31,6 +32,7 @@ def main() -> None:
     options = parser.parse_args()
     cases = {"none": [], "one": [("combined", "A")], "all": list(paper_a_tables.PUBLISHED)}[options.recipe]
     sections: dict[str, Callable[[], tuple[str, str]]] = {
+        "memory": lambda: (paper_a_memory.memory(), ""),  # first, before anything else has used some
         "tables": lambda: (paper_a_tables.tables_1_to_3(cases, options.iterations), paper_a_tables.NOTE),
         "windows": lambda: (paper_a_tables.table_4(), paper_a_tables.NOTE),
         "noise": lambda: (paper_a_tables.table_5(), paper_a_tables.NOTE),
