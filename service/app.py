@@ -49,7 +49,7 @@ async def _running(
     if interrupted:
         log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
     hub = Hub(database, metrics, settings.stream_buffer)
-    live_state = Live(database, hub, workbench, settings.false_alarm_rate)
+    live_state = Live(database, hub, metrics, workbench, settings.false_alarm_rate)
     runner = Jobs(
         database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
     )

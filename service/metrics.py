@@ -33,6 +33,7 @@ class Metrics:
         self.jobs = Counter("twin_jobs", "Jobs that ended.", ("kind", "state"), registry=self.registry)
         self.jobs_running = Gauge("twin_jobs_running", "Jobs that run now.", registry=self.registry)
         self.assimilated = Counter("twin_assimilated_samples", "Samples that updated a state.", registry=self.registry)
+        self.skipped = Counter("twin_skipped_samples", "Samples that no state could take.", registry=self.registry)
 
     def render(self) -> bytes:
         """Return everything in the text format of Prometheus."""

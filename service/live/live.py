@@ -4,6 +4,7 @@ from numpy.typing import NDArray
 
 from service.live.engine import Engine
 from service.live.tracker import Tracker
+from service.metrics import Metrics
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
@@ -14,16 +15,20 @@ from twin_core.anomaly import Thresholds
 class Live:
     """Every tracker of this service."""
 
-    def __init__(self, database: Database, hub: Hub, workbench: type[Workbench], false_alarm_rate: float) -> None:
+    def __init__(
+        self, database: Database, hub: Hub, metrics: Metrics, workbench: type[Workbench], false_alarm_rate: float
+    ) -> None:
         """Start without twins."""
         self.engine = Engine(workbench)
-        self._database, self._hub, self._thresholds = database, hub, Thresholds(false_alarm_rate)
+        self._database, self._hub, self._metrics = database, hub, metrics
+        self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
 
     def add(self, twin: Entry) -> None:
         """Begin to track a twin."""
         if twin.key not in self._trackers:
-            self._trackers[twin.key] = Tracker(twin, self._database, self._hub, self.engine, self._thresholds)
+            rooms = (self._database, self._hub, self.engine, self._metrics)
+            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds)
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from service.live import progress
 from service.live.engine import Engine
 from service.live.progress import Step
+from service.metrics import Metrics
 from service.registry import Entry
 from service.store import models
 from service.store.anomalies import Change
@@ -95,13 +96,16 @@ class _Caution:
 class Tracker:
     """Keeps one twin's state up to date in the background."""
 
-    def __init__(self, twin: Entry, database: Database, hub: Hub, engine: Engine, thresholds: Thresholds) -> None:
+    def __init__(
+        self, twin: Entry, database: Database, hub: Hub, engine: Engine, metrics: Metrics, thresholds: Thresholds
+    ) -> None:
         """Start in the background; the state comes from the last checkpoint."""
         self.twin = twin
         self.active: Active | None = None
         self.position: Position | None = None
         self.trouble: str | None = None
-        self._database, self._hub, self._engine, self._thresholds = database, hub, engine, thresholds
+        self._database, self._hub, self._engine = database, hub, engine
+        self._metrics, self._thresholds = metrics, thresholds
         self._caution = _Caution()
         self._news, self._wake, self._idle = _News(), asyncio.Event(), asyncio.Event()
         self._wake.set()
@@ -200,6 +204,7 @@ class Tracker:
         except (TwinError, ArithmeticError, ValueError) as error:
             self.trouble = str(error)
             if caution.failed(fresh.time_us):
+                self._metrics.skipped.inc(int(fresh.time_us.size))
                 extra = {"twin": self.twin.name, "reason": self.trouble, "samples": int(fresh.time_us.size)}
                 log.warning("samples that cannot be assimilated are skipped", extra=extra)
             return True
@@ -229,6 +234,7 @@ class Tracker:
         after = Position(int(time_us[-1]), count, done.state, held, detector, _sampling_s(time_us, before))
         step = Step(active.version, time_us, innovation, std, nis, np.isin(time_us, told), changes, after.checkpoint())
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
+        self._metrics.assimilated.inc(int(time_us.size))
         self.position = after
 
 

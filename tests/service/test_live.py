@@ -95,6 +95,10 @@ def test_samples_that_cannot_be_assimilated_are_skipped(client: AppClient, unfit
     found = residuals(client)
     assert not {f"1970-01-01T00:0{k // 60}:{k % 60:02d}Z" for k in unfit} & found.keys()
     lost = 300 - len(found)
+    text = client.get("/metrics").text
+    assert (
+        f"twin_skipped_samples_total {lost:.1f}" in text and f"twin_assimilated_samples_total {len(found):.1f}" in text
+    )
     assert len(unfit) <= lost <= 2 * len(unfit)  # a stretch costs at most its own length of good samples after it
     assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).status_code == 200
     send(client, [300], [SCALE_K * 101])
