@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from service.instants import format_instant, format_instants, now_us, parse_instants
-from service.live.tracker import Position, Tracker
+from service.live.position import Position
+from service.live.tracker import Tracker
 from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Columns, ForecastRequest

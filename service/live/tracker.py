@@ -3,25 +3,24 @@
 import asyncio
 import logging
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from service.live import progress
 from service.live.engine import Engine
+from service.live.position import Position, sampling_s, stretch
 from service.live.progress import Step
 from service.metrics import Metrics
 from service.registry import Entry
 from service.store import models
 from service.store.anomalies import Change
-from service.store.checkpoints import Checkpoint
 from service.store.database import Database
 from service.store.gone import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
-from service.workbench import Filtered, Telemetry
+from service.workbench import Filtered
 from twin_core.anomaly import Thresholds, detect
 from twin_core.errors import TwinError
 
@@ -30,33 +29,6 @@ log = logging.getLogger("service.live")
 PAUSE_S = 0.05
 """Shortest time between two steps, so that samples sent one by one are assimilated together."""
 RETRY_S = 2.0
-
-Json = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Position:
-    """Where the assimilation stands: the last assimilated sample, its state, and the inputs that hold there."""
-
-    time_us: int
-    n_samples: int
-    state: Json
-    held: dict[str, float]
-    detector: Json
-    sampling_s: float
-
-    @classmethod
-    def of(cls, checkpoint: Checkpoint) -> "Position":
-        """Return the position that a checkpoint describes."""
-        body = checkpoint.body
-        return cls(
-            checkpoint.time_us, checkpoint.n_samples, body["state"], body["held"], body["detector"], body["sampling_s"]
-        )
-
-    def checkpoint(self) -> Checkpoint:
-        """Return the checkpoint that describes this position."""
-        names = ("state", "held", "detector", "sampling_s")
-        return Checkpoint(self.time_us, self.n_samples, {name: getattr(self, name) for name in names})
 
 
 @dataclass
@@ -198,7 +170,7 @@ class Tracker:
         fresh = await self._database.read(progress.next_samples, self.twin, start_us, caution.most)
         if fresh.time_us.size == 0:
             return False
-        telemetry, held = _telemetry(self.twin, fresh, active.epoch_us, before)
+        telemetry, held = stretch(self.twin, fresh, active.epoch_us, before)
         try:
             done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
         except (TwinError, ArithmeticError, ValueError) as error:
@@ -231,39 +203,8 @@ class Tracker:
         detector, intervals = detect(detector, done.sensors, time_us, reading, innovation, std, nis, self._thresholds)
         changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
-        after = Position(int(time_us[-1]), count, done.state, held, detector, _sampling_s(time_us, before))
+        after = Position(int(time_us[-1]), count, done.state, held, detector, sampling_s(time_us, before))
         step = Step(active.version, time_us, innovation, std, nis, np.isin(time_us, told), changes, after.checkpoint())
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
         self._metrics.assimilated.inc(int(time_us.size))
         self.position = after
-
-
-def _telemetry(
-    twin: Entry, fresh: Samples, epoch_us: int, before: Position | None
-) -> tuple[Telemetry, dict[str, float]]:
-    """Return a block for the filter and the inputs that hold at its end.
-
-    It opens with the sample that the state knows already, of which only the inputs matter.
-    """
-    held = {} if before is None else before.held
-    known = 0 if before is None else 1
-    values: dict[str, NDArray[np.float64]] = {}
-    after = dict(held)
-    for row, name in enumerate(twin.channels):
-        is_sensor = name in twin.sensors
-        first = np.full(known, np.nan if is_sensor else held.get(name, np.nan))
-        column = np.concatenate([first, fresh.values[row]])
-        seen = np.flatnonzero(np.isfinite(column))
-        if seen.size and not is_sensor:
-            after[name] = float(column[seen[-1]])
-        if is_sensor or seen.size:
-            values[name] = column
-    known_us = [] if before is None else [before.time_us]
-    return Telemetry(epoch_us, np.concatenate([np.array(known_us, dtype=np.int64), fresh.time_us]), values), after
-
-
-def _sampling_s(time_us: NDArray[np.int64], before: Position | None) -> float:
-    """Return the usual distance of samples."""
-    if time_us.size > 10 or before is None:
-        return float(np.median(np.diff(time_us))) / 1e6 if time_us.size > 1 else 60.0
-    return before.sampling_s
