@@ -24,6 +24,7 @@ from twin_core.simulate.one_step import Steps, one_step
 from twin_core.simulate.rollout import balance_along
 
 FLOOR_SHARE = 1e-3
+NO_HEAT_W = 1e-9
 
 
 @dataclass(frozen=True)
@@ -165,6 +166,12 @@ def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nomi
         count = int(nominal.segment.valid.sum())
         total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
     return total if np.isfinite(total) else -np.inf
+
+
+def gain_of_latent_heat(fit: HeatFit) -> float:
+    """Return the log-likelihood that undeclared heat adds to a fit, in nats: next to nothing where nothing is missing."""
+    none = LatentHeat(np.full_like(fit.latent.std_W, NO_HEAT_W), fit.latent.length_s)
+    return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
 
 
 def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 from twin_core._typing import Progress
+from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, try_effects, weigh
 from twin_core.discover.judge import Finding, Judged, Search, accept, threshold, worth
 from twin_core.discover.screen import Probe, Screening, joint_gain
@@ -56,7 +57,9 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
-    """Add the best supported effect, or pair of effects, to the state; False if none is supported."""
+    """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
+    if gain_of_latent_heat(state.trial.fit) <= needed:
+        return False
     if _extend_by_heat(state, needed, fallback=fallback):
         return True
     return extend_by_trajectory(state, needed, fallback=fallback)
