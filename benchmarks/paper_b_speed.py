@@ -149,10 +149,16 @@ def time_statsmodels(model: LinearModel, y: FloatArray) -> tuple[float, float]:
     return _best(call)
 
 
+OTHERS: dict[str, Callable[[LinearModel, FloatArray], tuple[float, float]]] = {
+    "dynamax": time_dynamax,
+    "statsmodels": time_statsmodels,
+}
+
+
 def compare(sizes: tuple[int, ...]) -> tuple[list[Timing], list[str]]:
     """Time every installed library at every size and sampling; also return a line for each that is missing."""
     timings, notices = [], []
-    others = {"dynamax": time_dynamax, "statsmodels": time_statsmodels}
+    others = dict(OTHERS)
     for name in list(others):
         if find_spec(name) is None:
             notices.append(f"{name} is not installed (`pip install thermal-twin[bench]`): its rows are left out.")

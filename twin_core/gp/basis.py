@@ -11,6 +11,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import whole
 
 SMALLEST_SCALE_K = 1e-3
 """Half-range below which a temperature counts as constant."""
@@ -41,8 +42,7 @@ class Basis:
 
     def __post_init__(self) -> None:
         """Refuse what is no degree or no range."""
-        if self.degree < int(self.vanishing):
-            raise ModelError(f"degree must be at least {int(self.vanishing)}, it is {self.degree}")
+        whole(self.degree, "degree", lowest=int(self.vanishing))
         sizes = {len(self.low_K), len(self.high_K)}
         if sizes not in ({1}, {2}) or (self.vanishing and sizes != {2}):
             raise ModelError("low_K and high_K must hold one temperature each, or two where a boundary takes part")

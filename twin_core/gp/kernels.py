@@ -20,6 +20,10 @@ from scipy.special import ive
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import whole
+
+ROUGHEST = 1e8
+"""Largest smoothness⁻²: all harmonics kept are alike there to eight digits, and Bessel functions end soon after."""
 
 Values = NDArray[np.inexact[Any]]
 """Real, or complex with a tiny imaginary part that carries a derivative."""
@@ -134,8 +138,9 @@ class Periodic(Kernel):
 
     def __post_init__(self) -> None:
         """Refuse a period or a number of harmonics that makes no sense."""
-        if not self.period_s > 0.0 or self.n_harmonics < 1:
-            raise ModelError("Periodic: period_s must be positive and n_harmonics at least 1")
+        if not 0.0 < self.period_s < np.inf:
+            raise ModelError(f"Periodic: period_s must be positive, it is {self.period_s}")
+        whole(self.n_harmonics, "Periodic: n_harmonics", lowest=1)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -167,6 +172,11 @@ class Sum(Kernel):
     """Sum of independent kernels."""
 
     parts: tuple[Kernel, ...]
+
+    def __post_init__(self) -> None:
+        """Refuse what is no kernel."""
+        if not self.parts or not all(isinstance(part, Kernel) for part in self.parts):
+            raise ModelError(f"Sum: needs kernels, it has {self.parts!r}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -202,6 +212,8 @@ def _parts(kernel: Kernel) -> tuple[Kernel, ...]:
 def _harmonic_shares(smoothness: float | complex, n_harmonics: int) -> Values:
     """Return q_j², j = 0..n_harmonics, normalised to one: 2 I_j(z) exp(-z), I_0(z) exp(-z), z = smoothness⁻²."""
     z = 1.0 / (smoothness * smoothness)
+    if np.real(z) > ROUGHEST:
+        z = ROUGHEST + 0.0 * z
     orders = np.arange(n_harmonics + 1)
     at = ive(orders, np.real(z))
     # d/dz [I_j(z) exp(-z)] by the recurrence of Bessel functions; it carries a complex step that ive itself would lose.

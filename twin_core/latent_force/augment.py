@@ -49,7 +49,9 @@ def augment(
     n = network.n_nodes
     n_states = n + sum(b.observation.size for b in blocks)
     count = max(network.jacobian_per_s.shape[0], network.capacity_J_per_K.shape[0])
-    kind = np.result_type(network.jacobian_per_s, network.capacity_J_per_K, *(b.feedback for b in blocks))
+    kind = np.result_type(
+        network.jacobian_per_s, network.capacity_J_per_K, *(a for b in blocks for a in (b.feedback, b.diffusion))
+    )
     feedback, diffusion = np.zeros((count, n_states, n_states), dtype=kind), np.zeros((n_states, n_states), dtype=kind)
     feedback[:, :n, :n] = network.jacobian_per_s
     diffusion[range(n), range(n)] = drift_K2_per_s

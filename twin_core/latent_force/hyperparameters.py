@@ -13,6 +13,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import numbers
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.posterior import GammaPrior, Posterior
 
@@ -21,6 +22,11 @@ LONGEST_STEP = 1.5
 MAX_STEPS = 60
 GAIN_LIMIT = 1e-9
 """The climb ends when a full step promises less than this many nats."""
+MAX_NEWTON_STEPS = 5
+NEWTON_LIMIT = 1e-6
+"""A Newton step that promised less than this many nats ends at rest: what it leaves is of the order of its square."""
+FLAT = 1e-2
+"""A maximum whose curvature falls below this in any direction of ln(parameters), a factor of 20 000 either way, is none."""
 BLIND_STD = 2.0
 """Standard deviation of ln(parameter) from the data alone above which a direction is called not identifiable."""
 
@@ -121,9 +127,9 @@ def fit_map(
         raise ModelError(f"start must name the parameters {', '.join(model.names)}; it names {', '.join(start)}")
     if not model.names:
         raise ModelError("the model has no parameter to fit: give it a latent force, or names of parameters")
-    tried = {name: np.atleast_1d(np.asarray(start[name], dtype=np.float64)) for name in model.names}
+    tried = {name: np.atleast_1d(numbers(start[name], f"start of '{name}'")) for name in model.names}
     for name, values in tried.items():
-        if not (values.size and (values > 0.0).all() and np.isfinite(values).all()):
+        if not (values.size and (values > 0.0).all()):
             raise ModelError(f"start of '{name}': must be positive, it is {start[name]}")
     points = [np.log(p) for p in product(*tried.values())]
     ranked = [(posterior.value(p), k) for k, p in enumerate(points)] if len(points) > 1 else [(0.0, 0)]
@@ -156,27 +162,34 @@ def _climb(posterior: Posterior, point: FloatArray) -> tuple[FloatArray, int, bo
     return point, MAX_STEPS, False
 
 
-def _laplace(posterior: Posterior, point: FloatArray, n_steps: int, converged: bool) -> MapFit:
-    """Polish the maximum by Newton steps and turn the curvature there into covariances."""
-    hessian = posterior.hessian(point)
-    for _ in range(2):
-        gradient = posterior.expand(point)[2]
-        if np.linalg.eigvalsh(hessian).max() >= 0:
+def _polish(posterior: Posterior, point: FloatArray) -> tuple[FloatArray, FloatArray, bool]:
+    """Climb on by Newton steps; return the point, the Hessian beside it and whether it is at rest."""
+    for _ in range(MAX_NEWTON_STEPS):
+        hessian, gradient = posterior.hessian(point), posterior.expand(point)[2]
+        if np.linalg.eigvalsh(hessian).max() > -FLAT:
             break
         step = np.linalg.solve(-hessian, gradient)
         if np.abs(step).max() > 0.3 or posterior.value(point + step) < posterior.value(point):
             break
         point = point + step
+        if gradient @ step < NEWTON_LIMIT:
+            return point, hessian, True
+    return point, hessian, False
+
+
+def _laplace(posterior: Posterior, point: FloatArray, n_steps: int, converged: bool) -> MapFit:
+    """Turn the curvature at the maximum into covariances."""
+    point, hessian, polished = _polish(posterior, point)
     value, likelihood, gradient, _ = posterior.expand(point)
     values = np.exp(point)
     notices = _blind_directions(posterior, point, hessian)
     curvature = (hessian - np.diag(gradient)) / np.outer(values, values)
     names = posterior.model.names
-    if np.linalg.eigvalsh(hessian).max() >= 0:
+    if np.linalg.eigvalsh(hessian).max() > -FLAT:
         blank = np.full(hessian.shape, np.nan)
         return MapFit(names, values, blank, blank, likelihood, value, "no maximum", n_steps, notices)
     covariance, log_covariance = (np.asarray(np.linalg.inv(-m), dtype=np.float64) for m in (curvature, hessian))
-    outcome: Outcome = "maximum" if converged else "not at rest"
+    outcome: Outcome = "maximum" if converged or polished else "not at rest"
     return MapFit(names, values, covariance, log_covariance, likelihood, value, outcome, n_steps, notices)
 
 
@@ -190,5 +203,7 @@ def _blind_directions(posterior: Posterior, point: FloatArray, hessian: FloatArr
             shares = np.abs(direction) / np.abs(direction).max()
             named = [name for name, share in zip(posterior.model.names, shares, strict=True) if share > 0.3]
             verb = "is" if len(named) == 1 else "together are"
-            notices.append(f"{' and '.join(named)} {verb} not identifiable from these data: the prior decides")
+            held = any(posterior.has_prior(name) for name in named)
+            told = "the prior decides" if held else "there is no prior either"
+            notices.append(f"{' and '.join(named)} {verb} not identifiable from these data: {told}")
     return tuple(notices)

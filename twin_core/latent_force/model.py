@@ -112,8 +112,10 @@ class ForceModel:
         Raises
         ------
         ModelError
-            A node or sensor does not exist, or a shape does not fit.
+            A node or sensor does not exist, a shape does not fit, or what should be a kernel is none.
         """
+        if not isinstance(kernel, Kernel):
+            raise ModelError(f"kernel: must be a kernel such as Matern(3), it is {kernel!r}")
         names = list(kernel.names) if shared else [f"{name}[{node}]" for node in nodes for name in kernel.names]
         size = len(kernel.names)
         starts = [0 if shared else k * size for k in range(len(nodes))]

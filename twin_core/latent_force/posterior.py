@@ -51,6 +51,10 @@ class Posterior:
         self.model, self.observations = model, observations
         self.priors = [priors.get(name) for name in model.names]
 
+    def has_prior(self, name: str) -> bool:
+        """Return whether a parameter has a prior."""
+        return self.priors[self.model.names.index(name)] is not None
+
     def value(self, point: FloatArray) -> float:
         """Return the log posterior density, -inf where the model has no likelihood."""
         with np.errstate(over="ignore"):

@@ -14,7 +14,7 @@ import numpy as np
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
 from twin_core.gp.basis import Basis
-from twin_core.gp.checked import numbers
+from twin_core.gp.checked import numbers, positive, whole
 from twin_core.gp.columns import whiten_responses
 from twin_core.gp.discretise import discretise
 from twin_core.gp.polynomial import ForcePolynomial
@@ -100,14 +100,18 @@ def learn_heat_flow(
     picked = tuple(range(len(model.forces))) if only is None else tuple(only)
     if not picked:
         raise ModelError("the model has no latent force to learn a heat flow from")
-    n_times = observations.shape[0]
+    values = positive(values, model.names)
+    n_times = model.network(values[list(model.network_index)]).time_s.size
     for k in picked:
-        if not 0 <= k < len(model.forces):
-            raise ModelError(f"only: there is no force {k}, the model has {len(model.forces)}")
-    if smoothed.time_s.size != n_times or smoothed.mean_W.shape[1] != len(model.forces):
+        if k not in range(len(model.forces)) or picked.count(k) > 1:
+            raise ModelError(f"only: there is no force {k}, or it is named twice; the model has {len(model.forces)}")
+    if smoothed.mean_W.shape != (n_times, len(model.forces)):
         raise ModelError(f"smoothed has {smoothed.mean_W.shape} forces, the model needs {(n_times, len(model.forces))}")
-    if max_degree < 0 or (vanishing and max_degree < 1):
-        raise ModelError(f"max_degree must be at least {int(bool(vanishing))}, it is {max_degree}")
+    whole(
+        max_degree if degree is None else degree,
+        "max_degree" if degree is None else "degree",
+        lowest=int(bool(vanishing)),
+    )
     if boundary_K is not None:
         boundary_K = numbers(boundary_K, "boundary_K", (n_times,))
     _refuse_shared(model, picked)

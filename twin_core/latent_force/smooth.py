@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.errors import ModelError
+from twin_core.gp.checked import positive
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.smoother import smooth
 from twin_core.latent_force.linearised import Linearised
@@ -72,9 +73,7 @@ def smooth_force(model: ForceModel, observations: FloatArray, values: FloatArray
     ModelError
         A shape is wrong or a parameter is not positive.
     """
-    at = np.asarray(values, dtype=np.float64)
-    if at.shape != (len(model.names),) or not ((at > 0) & np.isfinite(at)).all():
-        raise ModelError(f"values must be {len(model.names)} positive numbers: {', '.join(model.names)}")
+    at = positive(values, model.names)
     linear = model.linear_model(at)
     filtered = kalman_filter(linear, observations)
     smoothed = smooth(linear, filtered)

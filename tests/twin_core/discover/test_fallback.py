@@ -131,7 +131,9 @@ def test_search_and_latent_force_learn_the_same_heat(found: Found) -> None:
     """Same degree, same range, and apart by less than two joint standard deviations everywhere: they share their noise."""
     one, other = found.law, latent_law(found)
     assert one.basis.degree == other.basis.degree == 2
-    np.testing.assert_allclose([*one.basis.low_K, *one.basis.high_K], [*other.basis.low_K, *other.basis.high_K], atol=0.1)
+    np.testing.assert_allclose(
+        [*one.basis.low_K, *one.basis.high_K], [*other.basis.low_K, *other.basis.high_K], atol=0.1
+    )
     visited = np.linspace(max(*one.basis.low_K, *other.basis.low_K), min(*one.basis.high_K, *other.basis.high_K), 25)
     a, b = one.predict(visited), other.predict(visited)
     assert (np.abs(a.mean_W - b.mean_W) < 2.0 * np.hypot(a.std_W, b.std_W)).all()

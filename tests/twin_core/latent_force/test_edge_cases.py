@@ -1,11 +1,14 @@
 """The ends of what may come in: a clear error or the correct answer, from sample to hyperparameters."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from tests.helpers import central_difference
 from twin_core.errors import ModelError
-from twin_core.gp.kernels import Matern
+from twin_core.gp.kernels import Matern, Periodic
 from twin_core.latent_force.hyperparameters import fit_map
 from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
@@ -22,10 +25,10 @@ VALUES = np.array([4.0, 60.0])
 PRIORS = {"std": GammaPrior(5.0, 1.0), "length_s": GammaPrior(3.0, 0.05)}
 
 
-def _model(jacobian=LOSSY, times=TIMES, **options) -> ForceModel:
+def _model(jacobian=LOSSY, times=TIMES, kernel=Matern(1), **options) -> ForceModel:
     network = Linearised(times, jacobian[None], np.zeros((times.size - 1, 2, 2)), np.full((1, 2), CAPACITY))
     parts = {"observation": np.eye(2), "noise_std_K": [0.05, 0.05], "prior_mean_K": [0.0, 0.0], "prior_std_K": 0.5}
-    return ForceModel.build(network, (1,), Matern(1), **(parts | options))
+    return ForceModel.build(network, (1,), kernel, **(parts | options))
 
 
 def _truth(jacobian=LOSSY) -> tuple[np.ndarray, np.ndarray]:
@@ -166,6 +169,12 @@ SAMPLES = np.zeros((TIMES.size, 2))
         (lambda: fit_map(_built(), SAMPLES, {"std": 3.0}, {"std": 2.0, "length_s": 20.0}), "must be a GammaPrior"),
         (lambda: fit_map(_built(nodes=()), SAMPLES, {}, {}), "no parameter to fit"),
         (lambda: GammaPrior(np.inf, 1.0), "shape and rate must be positive"),
+        (lambda: fit_map(_built(), SAMPLES, PRIORS, {"std": "a", "length_s": 20.0}), "start of 'std': must be numbers"),
+        (lambda: smooth_force(_built(), SAMPLES, ["a", "b"]), "2 positive numbers"),
+        (lambda: _built(kernel="matern"), "kernel: must be a kernel such as Matern"),
+        (lambda: Matern(1) + 3, "Sum: needs kernels"),
+        (lambda: Periodic(np.inf), "period_s must be positive, it is inf"),
+        (lambda: Periodic(100.0, 2.5), "n_harmonics must be a whole number, it is 2.5"),
         (lambda: Matern(1, decay=-1.0), "decay must be positive"),
     ],
 )
@@ -178,6 +187,10 @@ def test_nonsense_is_named_at_the_door(call, words):
     ("change", "words"),
     [
         ({"only": (4,)}, "there is no force 4"),
+        ({"only": (0, 0)}, "or it is named twice"),
+        ({"only": (0.5,)}, "there is no force 0.5"),
+        ({"degree": 2.5}, "degree must be a whole number"),
+        ({"max_degree": 2.5}, "max_degree must be a whole number"),
         ({"max_degree": -1}, "max_degree must be at least 0"),
         ({"degree": -1}, "degree must be at least 0"),
         ({"boundary_K": np.zeros(3)}, "boundary_K: has shape"),
@@ -198,6 +211,14 @@ def test_a_regression_along_another_record_is_named():
     short = _built(network=_network(time_s=TIMES[:10], constant_K_per_s=np.zeros((9, 2, 2))))
     with pytest.raises(ModelError, match="smoothed has"):
         learn_heat_flow(short, SAMPLES[:10], VALUES, found)
+
+
+def test_a_regression_at_values_that_are_none_is_named():
+    model = _built()
+    found = smooth_force(model, SAMPLES, VALUES)
+    for values in ([-4.0, 60.0], [4.0], [4.0, np.nan]):
+        with pytest.raises(ModelError, match="values must be 2 positive numbers: std, length_s"):
+            learn_heat_flow(model, SAMPLES, values, found)
 
 
 def test_nothing_seen_leaves_the_prior():
@@ -273,3 +294,39 @@ def test_without_samples_and_priors_there_is_no_maximum():
     assert (found.outcome, found.converged) == ("no maximum", False)
     assert "Give priors" in found.advice and np.isnan(found.covariance).all()
     assert any("std" in notice and "not identifiable" in notice for notice in found.notices)
+
+
+def test_white_heat_has_no_maximum():
+    """A random walk of temperature: shorter and stronger forces are ever alike, std² length alone is told."""
+    walk = 0.02 * np.cumsum(np.random.default_rng(0).normal(size=(TIMES.size, 2)), axis=0)
+    found = fit_map(_model(noise_std_K=0.0), walk, {}, {"std": 2.0, "length_s": 20.0})
+    assert found.outcome == "no maximum" and np.isnan(found.covariance).all()
+    assert found.notices == (
+        "std and length_s together are not identifiable from these data: there is no prior either",
+    )
+
+
+def test_a_climb_that_rises_slowly_is_finished_by_newton_steps():
+    """Scoring zigzags where force and noise trade; the gradient at the end is a central difference's zero."""
+    walk = 0.02 * np.cumsum(np.random.default_rng(0).normal(size=(TIMES.size, 2)), axis=0)
+    model = _model(estimate_noise=(0, 1))
+    start = {"std": 2.0, "length_s": 20.0, "noise_std_K[0]": 0.1, "noise_std_K[1]": 0.1}
+    found = fit_map(model, walk, {}, start)
+    assert found.converged
+    for direction in np.eye(4):
+
+        def likelihood(x: float, direction: np.ndarray = direction) -> np.ndarray:
+            return np.array(smooth_force(model, walk, found.values * np.exp(x * direction)).log_likelihood)
+
+        assert abs(central_difference(likelihood, 0.0, 1e-3)) < 1e-3
+
+
+def test_a_periodic_heat_of_any_smoothness_has_a_likelihood():
+    """Down to a train of pulses: all harmonics alike, and noise that asks for more ends without a maximum, not halfway."""
+    model = _model(kernel=Periodic(100.0))
+    noise = 0.3 * np.random.default_rng(0).normal(size=(TIMES.size, 2))
+    near, far = (smooth_force(model, noise, [4.0, s]).log_likelihood for s in (1.01e-4, 1e-12))
+    assert far == pytest.approx(near, rel=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert fit_map(model, noise, {}, {"std": 2.0, "smoothness": 1.0}).outcome == "no maximum"
