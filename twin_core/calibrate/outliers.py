@@ -28,6 +28,10 @@ COLDEST_K = 1.0
 AGREEMENT = 0.2
 """The readings before and after an excursion differ by less than this share of its height."""
 
+NEARBY, DOMINANT = 8, 5.0
+"""At an end of the record nothing shows that readings come back. They count only where the step to them is this many times
+the largest other one nearby: a record that begins or ends in a fast transient is no excursion."""
+
 
 def gross_outliers(column: FloatArray, noise_K: float) -> BoolArray:
     """Return which readings are gross outliers, (n_times,); never a missing one.
@@ -52,9 +56,16 @@ def gross_outliers(column: FloatArray, noise_K: float) -> BoolArray:
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         around = [values[i] for i in (first - 1, last) if 0 <= i < values.size]
         height = float(np.abs(leap[first:last]).min())
-        if last - first <= LONGEST_RUN and np.ptp(around) < AGREEMENT * height:
+        returns = len(around) == 2 or _one_leap(values[max(first - NEARBY, 0) : last + NEARBY])
+        if last - first <= LONGEST_RUN and np.ptp(around) < AGREEMENT * height and returns:
             found[at[first:last]] = True
     return found
+
+
+def _one_leap(values: FloatArray) -> bool:
+    """Return whether one step dominates all others."""
+    steps = np.sort(np.abs(np.diff(values)))
+    return bool(steps[-1] > DOMINANT * steps[-2])
 
 
 def without_outliers(spec: TwinSpec, records: Sequence[Record]) -> list[Record]:

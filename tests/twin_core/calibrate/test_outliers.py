@@ -49,6 +49,15 @@ def test_healthy_readings_are_kept() -> None:
         assert not gross_outliers(column, 0.1).any()
 
 
+@pytest.mark.parametrize("lasting", [2, 3, 4, 60])
+def test_a_record_that_begins_or_ends_in_a_fast_transient_is_kept(lasting: int) -> None:
+    """A closed form: 320 K, then an exponential decay of which a few readings are seen; and the same backwards in time."""
+    since = np.maximum(np.arange(60 + lasting) - 59.0, 0.0)
+    column = 290.0 + 30.0 * np.exp(-since / 10.0) + np.random.default_rng(0).normal(0.0, 0.01, since.size)
+    for healthy in (column, column[::-1]):
+        assert not gross_outliers(healthy, 0.01).any()
+
+
 def test_excluded_readings_are_not_talked_about() -> None:
     data = declared() | {"exclude": [{"start": 9000.0, "stop": 13500.0, "reason": "sensor test"}]}
     record = spoilt(telemetry(), [110, 120], 0.0)
