@@ -56,9 +56,10 @@ def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int)
     return list(starts.values())
 
 
-def _start(effect: Effect) -> tuple[object, tuple[float, ...]]:
-    """Return the place and the values that shape the effect without scaling it."""
-    return effect.place, tuple(effect.values[q.name] for q in effect.qualities() if q.null is None)
+def _start(effect: Effect) -> tuple[object, int, tuple[float, ...]]:
+    """Return the place, how many amplitudes the effect has, and the values that shape it without scaling it."""
+    shape = tuple(effect.values[q.name] for q in effect.qualities() if q.null is None)
+    return effect.place, len(effect.amplitudes), shape
 
 
 def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
