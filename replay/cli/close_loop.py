@@ -138,7 +138,8 @@ def describe(finding: dict[str, Any]) -> str:
 
     places = [" - ".join(place) if isinstance(place, list) else place for place in finding["where"].values()]
     values = [
-        f"{name} = {p['mean'] if isinstance(p['mean'], str) else short(p['mean'], 4)} ± {short(p['std'], 2)}"
+        f"{name} = {p['mean'] if isinstance(p['mean'], str) else short(p['mean'], 4)}"
+        + (f" ± {short(p['std'], 2)}" if p["std"] is not None else "")
         for name, p in finding.get("parameters", {}).items()
         if isinstance(p["mean"], int | float | str)
     ]

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from replay.cli.close_loop import describe
 from replay.cli.main import main
 
 TRUE = {"C:a": 1.1e4, "C:b": 6.5e3, "G:a|b": 3.0}
@@ -122,3 +123,10 @@ def test_simulate_in_both_formats(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert (tmp_path / name).stat().st_size > 0
     rows = (tmp_path / "a.csv").read_text().splitlines()
     assert rows[0] == "time_s,T_plate" and len(rows) == outcome["samples"] + 1
+
+
+def test_a_setting_without_uncertainty_is_told_without_one() -> None:
+    finding = {"effect": "x", "where": {"node": "a"}, "parameters": {"degree": {"mean": 2, "std": None}}}
+    assert describe(finding) == "x at a (degree = 2)"
+    finding["parameters"] = {"Q_W": {"mean": 2.5, "std": 0.25}}
+    assert describe(finding) == "x at a (Q_W = 2.5 ± 0.25)"
