@@ -3,8 +3,10 @@
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import click
+import numpy as np
 import pytest
 import yaml
 
@@ -14,6 +16,7 @@ from service.settings import Settings
 from twin_core.calibrate import METHODS
 from twin_core.effects import REGISTRY
 from twin_core.network.spec import load_spec
+from twin_core.telemetry import Record
 
 ROOT = Path(__file__).parent.parent
 DOCS = {path.name: path.read_text() for path in [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]}
@@ -84,6 +87,29 @@ def test_specification_example_is_valid() -> None:
     used = set(re.findall(r"[a-z_A-Z0-9]+(?=:)", example))
     for model in (type(spec), *(type(item) for item in (*spec.nodes, *spec.loads, *spec.channels.values()))):
         assert set(model.model_fields) <= used, f"the example shows not every field of {model.__name__}"
+
+
+def test_the_latent_force_example_finds_the_missing_heat() -> None:
+    """One node that leaks to a wall, at rest until 5 W are switched on: temperatures in closed form."""
+    spec = load_spec(
+        {
+            "twin": "t",
+            "boundaries": {"wall": {"value_K": 280.0}},
+            "channels": {"T": {"kind": "temperature", "unit": "K"}},
+            "nodes": [{"id": "tank", "sensor": "T", "capacity_J_per_K": {"value": 2000.0}}],
+            "conductors": [{"between": ["tank", "wall"], "conductance_W_per_K": {"value": 1.0}}],
+        }
+    )
+    time_s = 60.0 * np.arange(200)
+    warm_K = 280.0 + 5.0 * (1.0 - np.exp(-time_s / 2000.0))
+    noisy_K = warm_K + np.random.default_rng(0).normal(0.0, 0.05, time_s.size)
+    (example,) = blocks(section("latent-force.md", "From Python"), "python")
+    names: dict[str, Any] = {"spec": spec, "record": Record(time_s, {"T": noisy_K})}
+    exec(compile(example, "latent-force.md", "exec"), names)
+    assert np.abs(names["missing_W"] - 5.0)[10:].max() < 4.0 * names["band_W"].max()
+    ((label, weight),) = names["effect"].values.items()
+    assert label == "coefficients[0]" and abs(weight - 5.0) < 0.1
+    assert names["network"].parameters.index["learned_heat_flow(tank).coefficients[0]"] >= 0
 
 
 def test_every_link_leads_somewhere() -> None:
