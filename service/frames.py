@@ -24,14 +24,10 @@ class Batch:
         Microseconds since 1970.
     values : (n_channels, n_times)
         In the channels' own units, rows in the order of the twin's channels; NaN is a missing sample.
-    framed
-        Whether each sample came as a frame of its own: a frame without any value says nothing and is not taken in,
-        whereas a column may have a missing value wherever others have one.
     """
 
     time_us: Instants
     values: NDArray[np.float64]
-    framed: bool = False
 
 
 def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
@@ -76,27 +72,23 @@ def parse_frames(body: bytes, channels: Sequence[str]) -> Batch:
     Problem
         400 naming the line that is not JSON, 422 naming line and field otherwise.
     """
-    lines = [line for line in body.split(b"\n") if line.strip()]
-    frames = [_members(_load(line, f"line {n}"), f"line {n}: ") for n, line in enumerate(lines, start=1)]
+    lines = [(number, line) for number, line in enumerate(body.split(b"\n"), start=1) if line.strip()]
+    frames = [_members(_load(line, f"line {number}"), f"line {number}: ") for number, line in lines]
     known = set(channels)
-    for number, (_, sample) in enumerate(frames, start=1):
+    for (number, _), (_, sample) in zip(lines, frames, strict=True):
         if not known.issuperset(sample):
             stranger = next(name for name in sample if name not in known)
-            _position({name: 0 for name in channels}, stranger, f"line {number}: values.{stranger}")
+            _position(dict.fromkeys(channels, 0), stranger, f"line {number}: values.{stranger}")
     values = np.full((len(channels), len(frames)), np.nan)
     for row, name in enumerate(channels):
         column = [sample.get(name) for _, sample in frames]
-        values[row] = _numbers(column, partial(_line_field, name))
-    return Batch(_frame_times([time for time, _ in frames]), values, framed=True)
-
-
-def _frame_times(times: list[Any]) -> Instants:
+        values[row] = _numbers(column, partial(_line_field, lines, name))
     try:
-        return parse_instants(times)
+        return Batch(parse_instants([time for time, _ in frames]), values)
     except BadField as error:
         field, reason = error.errors[0]
-        number = int(field.removeprefix("time[").removesuffix("]")) + 1
-        raise BadField(f"line {number}: time", reason) from None
+        index = int(field.removeprefix("time[").removesuffix("]"))
+        raise BadField(f"line {lines[index][0]}: time", reason) from None
 
 
 def _load(body: bytes, where: str) -> Any:
@@ -156,8 +148,8 @@ def _element(name: str, index: int) -> str:
     return f"values.{name}[{index}]"
 
 
-def _line_field(name: str, index: int) -> str:
-    return f"line {index + 1}: values.{name}"
+def _line_field(lines: Sequence[tuple[int, bytes]], name: str, index: int) -> str:
+    return f"line {lines[index][0]}: values.{name}"
 
 
 _NUMBERS = {float, int, type(None)}

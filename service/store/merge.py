@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-ACCEPTED, DUPLICATE, CONFLICT, EMPTY = 0, 1, 2, 3
+ACCEPTED, DUPLICATE, CONFLICT = 0, 1, 2
 
 
 @dataclass(frozen=True)

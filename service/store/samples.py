@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from service.frames import Batch
 from service.store import outline
 from service.store.gone import TwinGone
-from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, EMPTY, collapse, merge
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, collapse, merge
 
 SMALL = 512
 """Chunks with fewer rows than this are compacted."""
@@ -44,9 +44,8 @@ class Receipt:
 
     @property
     def rejected(self) -> list[tuple[int, str]]:
-        """Where the samples stand that were not taken in, and why: they contradict the archive, or hold no value."""
-        positions = np.flatnonzero(self.status >= CONFLICT)
-        return [(i, "conflict" if self.status[i] == CONFLICT else "empty") for i in positions.tolist()]
+        """Where the samples stand that were not taken in, and why: they contradict the archive."""
+        return [(i, "conflict") for i in np.flatnonzero(self.status == CONFLICT).tolist()]
 
 
 @dataclass(frozen=True)
@@ -60,24 +59,12 @@ class Samples:
 def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
-    if batch.framed:
-        empty: NDArray[np.bool_] = np.logical_and.reduce(np.isnan(batch.values), axis=0)
-        if empty.any():
-            return _without(connection, twin, batch, empty)
     if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
         head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
         if head is not None:
             _write(connection, twin, batch, head)
             return Receipt(np.zeros(time_us.size, dtype=np.int8), head[0] - int(time_us.size) + 1, int(time_us[-1]))
     return _merge_in(connection, twin, batch)
-
-
-def _without(connection: sqlite3.Connection, twin: int, batch: Batch, empty: NDArray[np.bool_]) -> Receipt:
-    """Store a batch without its samples that hold no value."""
-    receipt = append(connection, twin, Batch(batch.time_us[~empty], batch.values[:, ~empty]))
-    status = np.full(empty.size, EMPTY, dtype=np.int8)
-    status[~empty] = receipt.status
-    return Receipt(status, receipt.first_seq, receipt.last_us)
 
 
 def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:

@@ -82,17 +82,36 @@ def test_frames_line_by_line_and_gzipped(registered: AppClient) -> None:
     assert registered.post(ROUTE, content=gzip.compress(body), headers=headers).json()["duplicates"] == 2
 
 
-def test_frames_without_a_value_are_named_and_not_stored(registered: AppClient) -> None:
+def test_a_sample_without_a_value_is_a_sample_in_either_form(registered: AppClient) -> None:
     headers = {"content-type": "application/x-ndjson"}
     lines = b'{"time": 50, "values": {}}\n{"time": 60, "values": {"T_px": null}}\n{"time": 70, "values": {"T_px": 1}}'
-    report = registered.post(ROUTE, content=lines, headers=headers).json()
-    rejected = [{"index": 0, "reason": "empty"}, {"index": 1, "reason": "empty"}]
-    assert (report["accepted"], report["duplicates"], report["rejected"]) == (1, 0, rejected)
-    lines = b'{"time": 70, "values": {"T_px": 2}}\n{"time": 70, "values": {}}\n{"time": 70, "values": {"T_px": 1}}'
-    report = registered.post(ROUTE, content=lines, headers=headers).json()
-    rejected = [{"index": 0, "reason": "conflict"}, {"index": 1, "reason": "empty"}]
-    assert (report["accepted"], report["duplicates"], report["rejected"]) == (0, 1, rejected)
-    assert registered.get(ROUTE).json()["values"]["T_px"] == [1]
+    for outcome in ("accepted", "duplicates"):
+        report = registered.post(ROUTE, content=lines, headers=headers).json()
+        assert (report[outcome], report["rejected"]) == (3, [])
+        assert send(registered, [150, 160, 170], T_px=[None, None, 1])[outcome] == 3
+        assert send(registered, [250])[outcome] == 1
+    assert send(registered, [60], T_px=[2])["accepted"] == 1
+    archive = registered.get(ROUTE).json()
+    assert archive["time"] == [f"1970-01-01T00:0{t // 60}:{t % 60:02}Z" for t in (50, 60, 70, 150, 160, 170, 250)]
+    assert archive["values"]["T_px"] == [None, 2, 1, None, None, 1, None]
+
+
+def test_lines_are_counted_as_an_editor_does(registered: AppClient) -> None:
+    for line, field in (
+        (b'{"time": "x", "values": {}}', "line 3: time"),
+        (b'{"time": 1, "values": {"T_px": "1"}}', "line 3: values.T_px"),
+        (b'{"time": 1, "values": {"T_no": 1}}', "line 3: values.T_no"),
+        (b'{"time": 1}', "line 3: values"),
+        (b"{", "line 3"),
+    ):
+        headers = {"content-type": "application/x-ndjson"}
+        body = b'{"time": 1, "values": {}}\n\n' + line + b"\n"
+        assert registered.post(ROUTE, content=body, headers=headers).json()["errors"][0]["field"] == field
+
+
+def test_plausible_limits_read_well(registered: AppClient) -> None:
+    refusal = registered.post(ROUTE, json={"time": [1], "values": {"T_px": [-5]}}).json()
+    assert refusal["detail"].endswith("plausible is 0 to 5000 K")
 
 
 def test_archive_of_a_part(registered: AppClient) -> None:
