@@ -1,7 +1,9 @@
 """Who may do what: API keys, their roles, and the gate in front of every route."""
 
 import hmac
+import ipaddress
 from enum import IntEnum
+from functools import lru_cache
 from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -89,8 +91,11 @@ class Gate:
             return 401, "a valid API key is needed: send 'Authorization: Bearer KEY'"
         if not self._keys and not _is_local(scope.get("client")):
             return 403, "this service has no API keys, so it answers callers on its own machine only"
+        host = headers.get(b"host", b"").decode("latin-1")
+        if not self._keys and not _names_this_machine(host):
+            return 403, "this service has no API keys, so it answers to local names only, such as localhost"
         origin = headers.get(b"origin")
-        if origin is not None and not self._keys and _netloc(origin) != headers.get(b"host", b"").decode("latin-1"):
+        if origin is not None and not self._keys and _netloc(origin) != host:
             return 403, "requests from other web sites are refused"
         return None
 
@@ -100,6 +105,26 @@ _HEADERS = frozenset({b"authorization", b"sec-websocket-protocol", b"origin", b"
 
 def _netloc(origin: bytes) -> str:
     return urlsplit(origin.decode("latin-1")).netloc
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address can only be reached from this machine."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+@lru_cache(maxsize=64)
+def _names_this_machine(host: str) -> bool:
+    """Return whether a ``Host`` cannot be a public name, which its owner may point at this machine for his pages."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    return is_loopback(name) or not ("." in name or ":" in name)
 
 
 def _is_local(client: tuple[str, int] | None) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,8 +22,8 @@ class Stretch(Protocol):
     def seqs(self) -> NDArray[np.int64]:
         """Their numbers, increasing."""
 
-    def messages(self, after_seq: int) -> Iterator[Json]:
-        """Yield those after a number."""
+    def messages(self, after_seq: int, count: int) -> Iterator[Json]:
+        """Yield the first ``count`` after a number, or all if there are fewer."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,10 @@ class SampleStretch:
     time_us: NDArray[np.int64]
     values: NDArray[np.float64]
 
-    def messages(self, after_seq: int) -> Iterator[Json]:
+    def messages(self, after_seq: int, count: int) -> Iterator[Json]:
         """Yield one message per sample, without the channels that it lacks."""
         first = int(np.searchsorted(self.seqs, after_seq, side="right"))
-        times = format_instants(self.time_us[first:])
+        times = format_instants(self.time_us[first : first + count])
         for offset, time in enumerate(times, start=first):
             column = self.values[:, offset].tolist()
             values = {name: v for name, v in zip(self.channels, column, strict=True) if v == v}
@@ -56,11 +57,11 @@ class ResidualStretch:
         """Their numbers."""
         return self.residuals.seq
 
-    def messages(self, after_seq: int) -> Iterator[Json]:
+    def messages(self, after_seq: int, count: int) -> Iterator[Json]:
         """Yield one message per assimilated sample."""
         found = self.residuals
         first = int(np.searchsorted(found.seq, after_seq, side="right"))
-        times = format_instants(found.time_us[first:])
+        times = format_instants(found.time_us[first : first + count])
         for offset, time in enumerate(times, start=first):
             column = found.innovation_K[:, offset].tolist()
             nis = float(found.nis[offset])
@@ -85,12 +86,11 @@ class EventStretch:
         """Their numbers."""
         return np.array([event.seq for event in self.events], dtype=np.int64)
 
-    def messages(self, after_seq: int) -> Iterator[Json]:
+    def messages(self, after_seq: int, count: int) -> Iterator[Json]:
         """Yield one message per event."""
-        for event in self.events:
-            if event.seq > after_seq:
-                head = {"type": event.type, "seq": event.seq, "time": format_instant(event.time_us)}
-                yield head | {name: value for name, value in event.body.items() if name not in head}
+        for event in islice((event for event in self.events if event.seq > after_seq), count):
+            head = {"type": event.type, "seq": event.seq, "time": format_instant(event.time_us)}
+            yield head | {name: value for name, value in event.body.items() if name not in head}
 
 
 def dropped(first_seq: int, last_seq: int) -> Json:

@@ -1,13 +1,12 @@
 """Settings: read once from ``TWIN_*`` environment variables into one frozen record."""
 
-import ipaddress
 from pathlib import Path
 from typing import Any
 
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.access import Role, parse_keys
+from service.access import Role, is_loopback, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
@@ -31,7 +30,7 @@ class Settings(BaseSettings):
         30.0, gt=0, description="Longest wait for a request head, or a body (plus 1 s per 32 KiB)."
     )
     stream_buffer: int = Field(
-        1000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
+        20_000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
     )
     job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
@@ -71,16 +70,6 @@ class Settings(BaseSettings):
     def database_path(self) -> Path:
         """The SQLite file."""
         return Path(self.database_url.removeprefix("sqlite:///"))
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address can only be reached from this machine."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def read_settings(**overrides: Any) -> Settings:

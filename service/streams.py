@@ -19,8 +19,12 @@ from service.store.database import Database
 P = ParamSpec("P")
 T = TypeVar("T")
 
+IN_MEMORY = 1000
+"""Messages of each twin that are kept in memory; readers that lag further behind are served from the store."""
 AT_ONCE = 256
 """Most messages handed to a reader in one piece."""
+AT_ONCE_STORED = 4096
+"""The same where the piece comes from the store, which is asked seldom rather than often."""
 IDLE_S = 15.0
 """An idle reader gets an empty piece this often, so that dead connections are noticed."""
 
@@ -54,10 +58,9 @@ class Topic:
         messages: list[Json] = []
         for stretch in self.recent:
             if int(stretch.seqs[-1]) > after_seq:
-                for message in stretch.messages(after_seq):
-                    messages.append(message)
-                    if len(messages) == count:
-                        return messages
+                messages.extend(stretch.messages(after_seq, count - len(messages)))
+                if len(messages) == count:
+                    break
         return messages
 
 
@@ -87,7 +90,7 @@ class Hub:
         topic = self._topics.get(twin)
         for stretch in stretches:
             if topic is not None and stretch.seqs.size:
-                topic.push(stretch, self._buffer)
+                topic.push(stretch, IN_MEMORY)
 
     def submit(
         self,
@@ -144,7 +147,7 @@ class Hub:
             messages = topic.since(position, AT_ONCE)
         else:
             names = (twin.channels, twin.sensors)
-            messages = await self._database.read(stream.since_seq, twin.key, *names, position, AT_ONCE)
+            messages = await self._database.read(stream.since_seq, twin.key, *names, position, AT_ONCE_STORED)
         if not messages:
             return self._skip(position, topic.head)
         first, last = int(messages[0]["seq"]), int(messages[-1]["seq"])

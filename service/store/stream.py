@@ -19,5 +19,5 @@ def since_seq(
     stretches: list[Stretch] = [SampleStretch(channels, numbers, found.time_us, found.values)]
     stretches += [ResidualStretch(sensors, r) for r in residuals.since_seq(connection, twin, len(sensors), after_seq)]
     stretches.append(EventStretch(tuple(events.since_seq(connection, twin, after_seq))))
-    messages = [message for stretch in stretches for message in stretch.messages(after_seq)]
+    messages = [message for stretch in stretches for message in stretch.messages(after_seq, count)]
     return sorted(messages, key=lambda message: int(message["seq"]))[:count]

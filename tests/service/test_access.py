@@ -62,6 +62,28 @@ def test_without_keys_only_this_machine_and_no_foreign_page_is_served(client: Ap
     assert client.get("/v1/twins", headers={"origin": "http://127.0.0.1"}).status_code == 200
 
 
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        ("evil.example", 403),
+        ("evil.example:8000", 403),
+        ("192.0.2.7", 403),
+        ("[2001:db8::1]:80", 403),
+        ("[::1", 403),
+        ("127.0.0.1:8000", 200),
+        ("127.1.2.3", 200),
+        ("localhost:8000", 200),
+        ("[::1]:8000", 200),
+        ("twin", 200),
+    ],
+)
+def test_without_keys_a_page_cannot_pass_off_its_own_name_as_this_machine(
+    client: AppClient, host: str, status: int
+) -> None:
+    assert client.get("/v1/twins", headers={"host": host}).status_code == status
+    assert client.get("/healthz", headers={"host": host}).status_code == 200
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.7", "example.org"])
 def test_other_addresses_need_keys(host: str) -> None:
     with pytest.raises(SettingsError, match="TWIN_API_KEYS is empty"):

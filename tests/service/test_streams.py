@@ -78,6 +78,21 @@ def test_a_reader_that_lags_too_far_is_told_what_it_missed(server: Server, twin:
         assert [json.loads(socket.recv(timeout=10))["seq"] for _ in range(100)] == list(range(201, 301))
 
 
+def test_a_batch_larger_than_what_is_kept_in_memory_reaches_its_readers(tmp_path: Path) -> None:
+    with Server(tmp_path) as server:
+        with server.client() as client:
+            client.register(SPEC)
+        with connect(socket_url(server, "benchsat")) as live:
+            for start in (0, 5000):
+                send(server, "benchsat", *range(start, start + 5000))
+            assert [json.loads(live.recv(timeout=10))["seq"] for _ in range(10_000)] == list(range(1, 10_001))
+        for _ in range(2):
+            with connect(socket_url(server, "benchsat", "?after_seq=7")) as late:
+                assert [json.loads(late.recv(timeout=10))["seq"] for _ in range(9993)] == list(range(8, 10_001))
+            server.stop()
+            server.start()
+
+
 def test_a_reader_that_does_not_read_slows_nobody(server: Server, twin: str) -> None:
     with connect(socket_url(server, twin), max_queue=1) as lazy, connect(socket_url(server, twin)) as eager:
         for start in range(0, 100_000, 5000):
