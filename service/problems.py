@@ -39,17 +39,22 @@ class BadField(Problem):
         super().__init__(status, f"{field}: {reason}", [(field, reason)])
 
 
-def problem(status: int, detail: str, errors: FieldErrors = (), headers: Mapping[str, str] | None = None) -> Response:
-    """Return the response for one problem."""
-    document: dict[str, Any] = {
+def document(status: int, detail: str, errors: FieldErrors = ()) -> bytes:
+    """Return the document of one problem."""
+    content: dict[str, Any] = {
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
         "status": status,
         "detail": detail,
     }
     if errors:
-        document["errors"] = [{"field": field, "detail": reason} for field, reason in errors]
-    return Response(orjson.dumps(document), status, dict(headers or {}), MEDIA_TYPE)
+        content["errors"] = [{"field": field, "detail": reason} for field, reason in errors]
+    return orjson.dumps(content)
+
+
+def problem(status: int, detail: str, errors: FieldErrors = (), headers: Mapping[str, str] | None = None) -> Response:
+    """Return the response for one problem."""
+    return Response(document(status, detail, errors), status, dict(headers or {}), MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:

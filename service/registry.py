@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.problems import Problem
+from service.problems import BadField, Problem
 from service.store.twins import Twin
 from twin_core.network.plausible import plausible_range
 from twin_core.network.spec import TwinSpec, load_spec
@@ -39,6 +39,24 @@ class Entry:
         ranges = [plausible_range(self.spec.channels[name]) for name in self.channels]
         low, high = np.array(ranges, dtype=np.float64).T
         return low[:, None], high[:, None]
+
+    def refuse_implausible(self, values: NDArray[np.float64], first: int = 0, prefix: str = "values.") -> None:
+        """Refuse what no instrument reads (422 naming the value), since a sample that is stored stays.
+
+        Parameters
+        ----------
+        values : (n_rows, n_times)
+            Of the channels from the position ``first`` on.
+        """
+        rows = slice(first, first + values.shape[0])
+        low, high = (limit[rows] for limit in self.limits)
+        wrong = (values < low) | (values > high)  # NaN compares as neither
+        if wrong.any():
+            row, column = (int(i) for i in np.argwhere(wrong)[0])
+            name = self.channels[first + row]
+            limits = f"{low[row, 0]:g} to {high[row, 0]:g} {self.units[name] or ''}".strip()
+            reason = f"no instrument reads {values[row, column]:g}; plausible is {limits}"
+            raise BadField(f"{prefix}{name}[{column}]", reason)
 
     @cached_property
     def units(self) -> dict[str, str | None]:

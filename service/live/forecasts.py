@@ -81,6 +81,7 @@ def _plan(twin: Entry, plan: Columns, epoch_us: int) -> Telemetry | None:
     for name, planned in values.items():
         if not np.isfinite(planned).any():
             raise BadField(f"plan.values.{name}", "plans no value; give some or leave the channel out")
+        twin.refuse_implausible(planned[None, :], twin.channels.index(name), "plan.values.")
     return Telemetry(epoch_us, time_us, values)
 
 

@@ -50,7 +50,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
         batch = await asyncio.to_thread(parse, body, entry.channels)
     else:
         batch = parse(body, entry.channels)
-    _refuse_implausible(entry, batch)
+    entry.refuse_implausible(batch.values)
     try:
         receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
     except TwinGone:
@@ -60,19 +60,6 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     report = _report(receipt, int(accepted.size))
     _count(service, twin, report)
     return Response(orjson.dumps(report), media_type="application/json")
-
-
-def _refuse_implausible(twin: Entry, batch: Batch) -> None:
-    """Refuse a body that holds what no instrument reads: once stored, a sample stays (422 naming the first)."""
-    low, high = twin.limits
-    wrong = (batch.values < low) | (batch.values > high)  # NaN compares as neither
-    if wrong.any():
-        row, column = (int(i) for i in np.argwhere(wrong)[0])
-        limits = f"{low[row, 0]:g} to {high[row, 0]:g} {twin.units[twin.channels[row]] or ''}".strip()
-        value = batch.values[row, column]
-        raise BadField(
-            f"values.{twin.channels[row]}[{column}]", f"no instrument reads {value:g}; plausible is {limits}"
-        )
 
 
 def _store(

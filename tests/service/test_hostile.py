@@ -1,6 +1,7 @@
 """Callers that mean harm or are broken: slow, endless, huge, malformed. The others notice nothing."""
 
 import http.client
+import json
 import socket
 import time
 from collections.abc import Iterator
@@ -62,6 +63,24 @@ def test_slow_callers_are_let_go_and_others_are_served(server: Server, first: by
         answer = read_to_end(connection)
         assert status in answer.split(b"\r\n", 1)[0]
         connection.close()
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"NONSENSE\r\n\r\n",
+        b"GET /healthz HTTP/1.1\r\n\r\n",
+        f"POST {ROUTE} HTTP/1.1\r\nHost: x\r\nContent-Length: many\r\n\r\n".encode(),
+        b"GET /healthz HTTP/1.1\r\nHost: x\r\nX: " + b"a" * 200_000,
+    ],
+    ids=["no request", "no host", "no length", "endless head"],
+)
+def test_what_is_no_http_is_told_so_as_any_other_problem(server: Server, head: bytes) -> None:
+    with dial(server) as connection:
+        connection.sendall(head)
+        lines, _, body = read_to_end(connection).partition(b"\r\n\r\n")
+    assert lines.startswith(b"HTTP/1.1 400") and b"application/problem+json" in lines
+    assert json.loads(body)["status"] == 400
 
 
 def test_large_bodies_are_refused_with_an_answer(server: Server) -> None:

@@ -180,6 +180,7 @@ WRONG_FORECASTS = (
     ({"horizon_s": 10, "plan": {"time": [105, 102], "values": {"Q_px": [1, 2]}}}, "plan.time[1]"),
     ({"horizon_s": 10, "plan": {"time": [99], "values": {"T_px": [290]}}}, "plan.values.T_px"),
     ({"horizon_s": 10, "plan": {"time": [99, 100], "values": {"Q_px": [None, None]}}}, "plan.values.Q_px"),
+    ({"horizon_s": 10, "plan": {"time": [99, 100], "values": {"Q_px": [1, 1e300]}}}, "plan.values.Q_px[1]"),
     ({"horizon_s": 10, "plan": {"time": [9, 98], "values": {"Q_px": [1, 2]}}}, "plan.time: ends before"),
     ({"horizon_s": 10, "plan": {"time": [110, 120], "values": {"Q_px": [1, 2]}}}, "plan.time: begins after"),
     ({"horizon_s": 10, "plan": {"time": ["x"], "values": {"Q_px": [1]}}}, "plan.time[0]"),

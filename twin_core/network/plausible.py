@@ -29,4 +29,4 @@ def plausible_range(channel: Channel) -> tuple[float, float]:
     if channel.kind != "temperature":
         return -LARGEST, LARGEST
     shift = ZERO_CELSIUS_K if channel.unit == "degC" else 0.0
-    return -shift, HOTTEST_K - shift
+    return 0.0 - shift, HOTTEST_K - shift
