@@ -1,11 +1,15 @@
 """Prometheus metrics of one application, in a registry of its own so that applications do not share numbers."""
 
 import time
+from http import HTTPMethod
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+METHODS = frozenset(HTTPMethod)
+"""Counted by name; whatever else a caller makes up is not, since each name is kept for ever."""
 
 
 class Metrics:
@@ -65,5 +69,6 @@ class Observe:
             await self._app(scope, receive, watched)
         finally:
             route = getattr(scope.get("route"), "path", "other")
-            self._metrics.requests.labels(scope["method"], route, str(status)).inc()
+            method = scope["method"] if scope["method"] in METHODS else "other"
+            self._metrics.requests.labels(method, route, str(status)).inc()
             self._metrics.duration_s.labels(route).observe(time.perf_counter() - started_s)

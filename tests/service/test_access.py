@@ -113,3 +113,11 @@ def test_wrong_settings_are_named(monkeypatch: pytest.MonkeyPatch, name: str, va
     monkeypatch.setenv(name, value)
     with pytest.raises(SettingsError, match=name):
         read_settings()
+
+
+def test_made_up_methods_do_not_grow_the_metrics(make_client) -> None:
+    client: AppClient = make_client(api_keys=KEYS)
+    for number in range(5):
+        assert client.request(f"MADEUP{number}", "/v1/twins").status_code == 401
+    metrics = client.get("/metrics", headers={"Authorization": "Bearer r-key"}).text
+    assert "MADEUP" not in metrics and 'method="other"' in metrics
