@@ -7,7 +7,7 @@ memory or else from the store, and a reader that lags too far is told so and mov
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.messages import Json, Stretch, dropped
@@ -72,6 +72,7 @@ class Hub:
         self._database, self._metrics, self._buffer = database, metrics, buffer
         self._loop = asyncio.get_running_loop()
         self._topics: dict[int, Topic] = {}
+        self._outcomes: deque[tuple[int, Future[Any], asyncio.Future[Any] | None]] = deque()
 
     def open(self, twin: int, head: int) -> None:
         """Start the stream of a twin."""
@@ -101,13 +102,31 @@ class Hub:
     ) -> "Future[tuple[T, Sequence[Stretch]]]":
         """Queue a write that makes messages; they are published right after its commit. From any thread."""
         answer = self._database.submit(operation, *args, **kwargs)
-        answer.add_done_callback(lambda done: self._after_commit(twin, done))
+        answer.add_done_callback(lambda done: self._after_commit(twin, done, None))
         return answer
 
-    def _after_commit(self, twin: int, done: "Future[tuple[Any, Sequence[Stretch]]]") -> None:
-        """Hand the messages to the event loop; the writer calls this in the order of the commits."""
-        if not done.cancelled() and done.exception() is None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self.publish, twin, done.result()[1])
+    def _after_commit(self, twin: int, done: "Future[Any]", waiter: "asyncio.Future[Any] | None") -> None:
+        """Hand an outcome to the event loop; the writer calls this in the order of the commits.
+
+        Waking the loop costs as much as a small write, so it is woken once for all that is handed over meanwhile.
+        """
+        self._outcomes.append((twin, done, waiter))
+        if len(self._outcomes) == 1 and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._take_outcomes)
+
+    def _take_outcomes(self) -> None:
+        """Publish what was committed, then let those who wait go on; in the event loop."""
+        while self._outcomes:
+            twin, done, waiter = self._outcomes.popleft()
+            error = CancelledError() if done.cancelled() else done.exception()
+            if error is None:
+                self.publish(twin, done.result()[1])
+            if waiter is None or waiter.done():
+                continue
+            if error is None:
+                waiter.set_result(done.result()[0])
+            else:
+                waiter.set_exception(error)
 
     async def write(
         self,
@@ -117,8 +136,10 @@ class Hub:
         **kwargs: P.kwargs,
     ) -> T:
         """Return the result of a write that makes messages, once it is committed."""
-        answer = self.submit(twin, operation, *args, **kwargs)
-        return (await asyncio.shield(asyncio.wrap_future(answer)))[0]
+        waiter: asyncio.Future[T] = self._loop.create_future()
+        answer = self._database.submit(operation, *args, **kwargs)
+        answer.add_done_callback(lambda done: self._after_commit(twin, done, waiter))
+        return await waiter
 
     async def follow(self, twin: Entry, after_seq: int | None) -> AsyncIterator[list[Json]]:
         """Yield messages in pieces, from a number on or from now on, until the twin or the service goes."""
