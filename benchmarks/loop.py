@@ -7,7 +7,7 @@ cases, appends one line of JSON per case to FILE (cases already in it are not ru
 import argparse
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.loop_cases import Task, suite
-from benchmarks.loop_table import save_tables
+from benchmarks.loop_table import Row, save_tables
 from benchmarks.network_cases import Case
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover import close_loop
@@ -98,8 +98,13 @@ def known_effect_error(case: Case) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
 
 
-def run_all(tasks: Iterable[Task], results: Path, n_processes: int) -> list[dict[str, Any]]:
-    """Run what the file of results lacks; return the rows of all the tasks. A case that fails is a row with its error."""
+def run_all(
+    tasks: Iterable[Task], results: Path, n_processes: int, work: Callable[[Task], Row], told: Callable[[Row], str]
+) -> list[Row]:
+    """Run what the file of results lacks; return the rows of all the tasks. A case that fails is a row with its error.
+
+    ``work`` runs a case, ``told`` says in one line what came of it.
+    """
     results.parent.mkdir(parents=True, exist_ok=True)
     done = {row["task"]: row for row in map(json.loads, results.read_text().splitlines())} if results.exists() else {}
     tasks = list(tasks)
@@ -108,7 +113,7 @@ def run_all(tasks: Iterable[Task], results: Path, n_processes: int) -> list[dict
         ProcessPoolExecutor(n_processes, mp_context=get_context("spawn")) as pool,
         results.open("a", encoding="utf-8") as out,
     ):
-        running = {pool.submit(run, task): task for task in todo}
+        running = {pool.submit(work, task): task for task in todo}
         for future in as_completed(running):
             task = running[future]
             error = future.exception()
@@ -116,14 +121,12 @@ def run_all(tasks: Iterable[Task], results: Path, n_processes: int) -> list[dict
             done[task.name] = row
             out.write(json.dumps(row) + "\n")
             out.flush()
-            print(line(row), flush=True)
+            print(f"{row['task']}: {row['error']}" if error else told(row), flush=True)
     return [done[task.name] for task in tasks]
 
 
 def line(row: dict[str, Any]) -> str:
     """Return a row in one line."""
-    if "error" in row:
-        return f"{row['task']}: {row['error']}"
     mark = (
         "ok  "
         if row["first"] or (row["effect"] is None and not row["findings"])
@@ -149,7 +152,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
     tasks = [t for t in suite(tuple(arguments.groups)) if not arguments.effects or t.effect in arguments.effects]
-    rows = run_all(tasks, arguments.results, arguments.processes)
+    rows = run_all(tasks, arguments.results, arguments.processes, run, line)
     if not arguments.effects:
         save_tables(rows)
 
