@@ -32,18 +32,18 @@ CLEAN_PER_EFFECT = 6
 
 METHODS = ("closed loop", "greedy BIC", "SINDy", "residual polynomial")
 NOTE = """All start from the same calibrated declared model; its calibration is part of everybody's seconds. Every model is
-rolled out open loop over the last 30 % of the record, from the state filtered at the end of the training part. Only the closed loop
-refits side by side on both cores.
+rolled out open loop over the last 30 % of the record, from the state filtered at the end of the training part. Only the
+closed loop refits side by side on both cores.
 
 - SINDy: pysindy's STLSQ on the residual heat of every sensed node. Library: 1, differences of T to every node and boundary
-  and of T^4 to every boundary, inputs, auxiliary channels by level, the harmonic that stands out. Columns standardised; residual
-  and library smoothed alike (Savitzky-Golay); smoothing, ridge and threshold by open-loop validation inside the training
-  part, "no term" among the choices. Its name is that of the largest term for which the vocabulary has one.
-- Residual polynomial: up to third order in each node's own temperature, order and smoothing chosen likewise; it names nothing.
-- Greedy BIC: all candidates of our registry, the six best screened places refitted in full per step on open-loop trajectories with our
-  solver, white-noise BIC, four effects at most.
+  and of T^4 to every boundary, inputs, auxiliary channels by level, the harmonic that stands out. Columns standardised;
+  residual and library smoothed alike (Savitzky-Golay); smoothing, ridge and threshold by open-loop validation inside the
+  training part, "no term" among the choices. Its name is that of the largest term that the vocabulary has one for.
+- Residual polynomial: up to third order in each node's own temperature, order and smoothing chosen likewise.
+- Greedy BIC: all candidates of our registry, the six best screened places refitted in full per step on open-loop
+  trajectories with our solver, white-noise BIC, four effects at most.
 
-A false finding is a name on a clean record; of the residual polynomial, any correction at all."""
+A false finding is a name on a clean record; of the residual polynomial, which names nothing, any correction at all."""
 
 
 def rivals_of(case: Case) -> dict[str, Callable[[], tuple[Regressed, float]]]:
