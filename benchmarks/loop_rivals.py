@@ -36,9 +36,10 @@ rolled out open loop over the last 30 % of the record, from the state filtered a
 closed loop refits side by side on both cores.
 
 - SINDy: pysindy's STLSQ on the residual heat of every sensed node. Library: 1, differences of T to every node and boundary
-  and of T^4 to every boundary, inputs, auxiliary channels by level, the harmonic that stands out. Columns standardised;
-  residual and library smoothed alike (Savitzky-Golay); smoothing, ridge and threshold by open-loop validation inside the
-  training part, "no term" among the choices. Its name is that of the largest term that the vocabulary has one for.
+  and of T^4 to every boundary, inputs, auxiliary channels by level, the harmonic that stands out. Residual and library
+  smoothed alike (Savitzky-Golay); columns scaled, centred or not; scaling, smoothing, ridge and threshold by open-loop
+  validation inside the training part, "no term" among the choices. Its name is that of the largest term that the
+  vocabulary has one for.
 - Residual polynomial: up to third order in each node's own temperature, order and smoothing chosen likewise.
 - Greedy BIC: all candidates of our registry, the six best screened places refitted in full per step on open-loop
   trajectories with our solver, white-noise BIC, four effects at most.

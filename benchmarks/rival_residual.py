@@ -37,11 +37,11 @@ SIMPLER_WITHIN = 1.02
 WINDOWS = (11, 31, 61)
 """Samples of the Savitzky-Golay filter, second order."""
 
-THRESHOLDS = (0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
+THRESHOLDS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Of STLSQ, in standard deviations of the residual heat: of the largest one, or of each node's own."""
 
-RIDGES = (1e-4, 1e-2, 1e-1)
-"""Of STLSQ, per row: columns are standardised."""
+RIDGES = (1e-4, 1e-2)
+"""Of STLSQ, per row: columns are scaled."""
 
 DEGREES = (1, 2, 3)
 IN_LIBRARY = (
@@ -153,11 +153,15 @@ class Residual:
 
 @dataclass(frozen=True)
 class Columns:
-    """A library on the residual of one node, standardised."""
+    """A library on the residual of one node, its columns scaled to one and, where wanted, centred.
+
+    Centred, nearly constant columns are told apart, but the constant takes the mean of every other term.
+    """
 
     residual: Residual
     node: int
     features: Sequence[Feature]
+    centred: bool = True
 
     @cached_property
     def raw(self) -> np.ndarray:
@@ -168,13 +172,14 @@ class Columns:
 
     @cached_property
     def scale(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation of the columns; infinite where one is constant, so that it weighs nothing."""
-        std = self.raw.std(axis=0)
-        return self.raw.mean(axis=0), np.where(std > 1e-9 * np.abs(self.raw).max(axis=0), std, np.inf)
+        """What is subtracted from the columns and what divides them; infinite where one is constant: it weighs nothing."""
+        middle = self.raw.mean(axis=0) if self.centred else np.zeros(self.raw.shape[1])
+        moves = self.raw.std(axis=0) > 1e-9 * np.abs(self.raw).max(axis=0)
+        return middle, np.where(moves, np.sqrt(np.mean((self.raw - middle) ** 2, axis=0)), np.inf)
 
     @cached_property
     def design(self) -> np.ndarray:
-        """Ones and the standardised columns."""
+        """Ones and the scaled columns."""
         mean, std = self.scale
         return np.hstack([np.ones((self.raw.shape[0], 1)), (self.raw - mean) / std])
 
@@ -184,7 +189,7 @@ class Columns:
         return self.residual.heat_W[:, self.node]
 
     def heat(self, coefficients: np.ndarray) -> FeatureHeat:
-        """Return what was regressed, in W per standard deviation of each column, as a heat into the node."""
+        """Return what was regressed, in W per scaled column, as a heat into the node."""
         mean, std = self.scale
         weights = coefficients[1:] / std
         kept = np.flatnonzero(weights)
@@ -251,12 +256,13 @@ def _sindy_options(calibration: Calibration) -> Iterable[Option]:
     levels = {n: channel_levels(records, n) for n, c in calibration.network.spec.channels.items() if c.levels}
     for window in WINDOWS:
         residual = Residual(calibration, window)
-        columns = [
-            Columns(residual, i, library(layout, layout.nodes[i], levels, residual.dominant_period_s(i)))
-            for i in residual.sensed
-        ]
-        for shared, ridge, threshold in product((True, False), RIDGES, THRESHOLDS):
-            yield Option(columns, _stlsq(threshold, ridge, shared=shared))
+        libraries = {
+            i: library(layout, layout.nodes[i], levels, residual.dominant_period_s(i)) for i in residual.sensed
+        }
+        for centred in (True, False):
+            columns = [Columns(residual, i, features, centred) for i, features in libraries.items()]
+            for shared, ridge, threshold in product((True, False), RIDGES, THRESHOLDS):
+                yield Option(columns, _stlsq(threshold, ridge, shared=shared))
 
 
 def _polynomial_options(calibration: Calibration) -> Iterable[Option]:
