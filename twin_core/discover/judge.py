@@ -24,7 +24,7 @@ LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
 UNTOLD_STD = 1.0
-"""Relative deviation of a positive parameter beyond which it is not told: a mass of any size is a boundary, not a mass."""
+"""Relative deviation beyond which a quantity is not told: a mass of any size is a boundary, not a mass."""
 
 EXPLAINED_SHARE = 0.5
 """An effect must make half of the latent heat's variance superfluous where it acts, or something else is missing there."""
@@ -111,9 +111,14 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
 
 
 def is_told(judged: Judged) -> bool:
-    """Return whether the data tell how large the effects are: no positive parameter is as uncertain as it is large."""
-    positive = [f"{e.label}.{q.name}" for e in judged.effects for q in e.qualities() if q.positive]
-    return all(judged.trial.free_std.get(name, 0.0) < UNTOLD_STD for name in positive)
+    """Return whether the data tell what shapes the effects: no such quantity is as uncertain as it is large."""
+    shapes = [
+        f"{effect.label}.{quality.name}"
+        for effect in judged.effects
+        for quality in effect.qualities()
+        if quality.positive and quality.null is None and not quality.open_ended
+    ]
+    return all(judged.trial.free_std.get(name, 0.0) < UNTOLD_STD for name in shapes)
 
 
 def is_valid(validation: Validation, n_effects: int = 1) -> bool:

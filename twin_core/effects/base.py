@@ -45,6 +45,8 @@ class Quality:
         Standard deviation of what no fit to this telemetry can tell: it adds to that of the fit.
     instant
         For an instant on the clock of ``Record.clock_s``: where the solver counts from, and in what; None for others.
+    open_ended
+        Whether the data may tell no more than that it is large: a limit that was never reached.
     """
 
     name: str

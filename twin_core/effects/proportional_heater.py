@@ -58,7 +58,7 @@ class ProportionalHeater(Effect):
         return (
             Quality("k_W_per_K", "W/K", null=0.0, positive=True),
             Quality("T_set_K", "K"),
-            Quality("Q_W", "W", positive=True, prior_std=3.0),
+            Quality("Q_W", "W", positive=True, prior_std=3.0, open_ended=True),
         )
 
     def addition(self, layout: Layout) -> Addition:
