@@ -7,9 +7,9 @@ from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_cases import Case, network_case
 from benchmarks.outside_vocabulary import OUTSIDE
 
-N_NETWORKS = 5
+N_NETWORKS = int(__import__("os").environ.get("NNET", "5"))
 N_FEM = 1
-N_CLEAN = 300
+N_CLEAN = int(__import__("os").environ.get("NCLEAN", "300"))
 N_OUTSIDE = 2
 FIRST_SEED = 1000
 """Seeds from here on belong to the suite; the tests use smaller ones."""

@@ -57,6 +57,7 @@ class Quality:
     lower: float | None = None
     instant: Shifted | None = None
     resolution: float = 0.0
+    open_ended: bool = False
 
     @property
     def transform(self) -> Transform:
