@@ -12,9 +12,16 @@ from twin_core.network.spec import TwinSpec, load_spec
 from twin_core.telemetry import Record
 
 
+TRAINING_SHARE = 0.7
+
+
 @dataclass(frozen=True)
 class Case:
-    """One case: what the operator declares and sees, and what is really there (None on a healthy spacecraft)."""
+    """One case: what the operator declares and sees, and what is really there (None on a healthy spacecraft).
+
+    ``trace`` is how far the effect moves the readings of the training part, rms over the noise: a heater that starts to
+    work in the hold-out leaves none, and nobody can find it.
+    """
 
     spec: TwinSpec
     record: Record
@@ -23,6 +30,7 @@ class Case:
     truth_K: np.ndarray
     onset_s: float | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
+    trace: float = float("inf")
 
 
 def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: float = 60.0) -> Case:
@@ -31,6 +39,9 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
     world = World(rng, n_orbits, dt_s)
     node = int(rng.integers(0, world.n))
     hidden = NOTHING if effect is None else (HIDDEN | OUTSIDE)[effect](world, node)
+    begun = rng.bit_generator.state
+    healthy = world.simulate()[:, : world.n]
+    rng.bit_generator.state = begun
     truth = world.simulate(hidden)[:, : world.n]
     read = truth if hidden.offset_K is None else truth + hidden.offset_K
     noise = float(rng.uniform(0.05, 0.15))
@@ -75,4 +86,5 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
         }
     )
     record = Record(world.time_s, values, None, f"case-{seed}")
-    return Case(spec, record, effect, hidden.where, truth, hidden.onset_s, hidden.parameters)
+    trace = float(np.sqrt(np.mean((read - healthy)[: int(TRAINING_SHARE * world.time_s.size)] ** 2))) / noise
+    return Case(spec, record, effect, hidden.where, truth, hidden.onset_s, hidden.parameters, trace)
