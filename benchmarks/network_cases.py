@@ -11,7 +11,6 @@ from benchmarks.outside_vocabulary import OUTSIDE
 from twin_core.network.spec import TwinSpec, load_spec
 from twin_core.telemetry import Record
 
-
 TRAINING_SHARE = 0.7
 
 
