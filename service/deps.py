@@ -3,8 +3,9 @@
 All of them are coroutines, although none waits: a plain function would be run in a thread, once per request each.
 """
 
-from dataclasses import dataclass
-from typing import Annotated
+import asyncio
+from dataclasses import dataclass, field
+from typing import Annotated, Any
 
 from fastapi import Depends, Path
 from starlette.requests import HTTPConnection
@@ -18,6 +19,7 @@ from service.registry import Entry, Registry
 from service.settings import Settings
 from service.store import twins
 from service.store.database import Database
+from service.store.gone import TwinGone
 from service.store.twins import Twin
 from service.streams import Hub
 
@@ -33,6 +35,7 @@ class Service:
     hub: Hub
     live: Live
     jobs: Jobs
+    _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def add_twin(self, twin: Twin) -> Entry:
         """Let a stored twin take part in everything."""
@@ -42,13 +45,23 @@ class Service:
             self.live.add(entry)
         return entry
 
+    async def register(self, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
+        """Return the twin, and whether it is new; never between the steps of a deletion."""
+        async with self._coming_and_going:
+            twin, is_new = await self.database.write(twins.register, name, specification)
+            self.add_twin(twin)
+            return twin, is_new
+
     async def remove_twin(self, twin: Entry) -> None:
-        """Stop whatever concerns a twin, then delete it."""
-        self.registry.remove(twin.name)
-        await self.jobs.cancel_twin(twin)
-        await self.live.remove(twin)
-        await self.database.write(twins.delete, twin.name)
-        self.hub.close(twin.key)
+        """Stop whatever concerns a twin, then delete it; Problem 404 if somebody else just did."""
+        async with self._coming_and_going:
+            if self.registry.get(twin.name) is not twin:
+                raise TwinGone(f"twin {twin.key} is gone")
+            self.registry.remove(twin.name)
+            await self.jobs.cancel_twin(twin)
+            await self.live.remove(twin)
+            await self.database.write(twins.delete, twin.name)
+            self.hub.close(twin.key)
 
 
 async def running_service(connection: HTTPConnection) -> Service:

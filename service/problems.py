@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
+from service.store.gone import TwinGone
 from twin_core.errors import TwinError
 
 MEDIA_TYPE = "application/problem+json"
@@ -63,6 +64,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(TwinError, _on_twin_error)
+    app.add_exception_handler(TwinGone, _on_gone)
     app.add_exception_handler(Exception, _on_crash)
 
 
@@ -104,6 +106,10 @@ async def _on_twin_error(_: Request, error: Exception) -> Response:
     field, separator, reason = str(error).partition(": ")
     errors = [(field, reason)] if separator and " " not in field else []
     return problem(422, str(error), errors)
+
+
+async def _on_gone(_: Request, error: Exception) -> Response:
+    return problem(404, "the twin was deleted meanwhile")
 
 
 async def _on_crash(request: Request, error: Exception) -> Response:

@@ -143,7 +143,9 @@ class Hub:
 
     async def follow(self, twin: Entry, after_seq: int | None) -> AsyncIterator[list[Json]]:
         """Yield messages in pieces, from a number on or from now on, until the twin or the service goes."""
-        topic = self._topics[twin.key]
+        topic = self._topics.get(twin.key)
+        if topic is None:  # deleted before its reader began
+            return
         position = topic.head if after_seq is None else min(after_seq, topic.head)
         waker = asyncio.Event()
         topic.wakers.add(waker)

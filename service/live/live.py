@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 from service.live.engine import Engine
 from service.live.tracker import Tracker
 from service.metrics import Metrics
+from service.problems import Problem
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
@@ -37,8 +38,13 @@ class Live:
             await tracker.close()
 
     def tracker(self, twin: Entry) -> Tracker:
-        """Return the tracker of a twin."""
-        return self._trackers[twin.key]
+        """Return the tracker of a twin; Problem 409 if nothing follows its samples."""
+        tracker = self._trackers.get(twin.key)
+        if tracker is None:
+            raise Problem(
+                409, f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted"
+            )
+        return tracker
 
     def arrived(self, twin: Entry, time_us: NDArray) -> None:
         """Pass on that samples were stored."""

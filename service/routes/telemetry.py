@@ -19,7 +19,6 @@ from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Archive, Columns, IngestReport
 from service.store import samples
-from service.store.gone import TwinGone
 from service.store.samples import Receipt, Samples
 
 router = APIRouter(prefix="/v1/twins/{twin}/telemetry", tags=["telemetry"])
@@ -51,10 +50,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     else:
         batch = parse(body, entry.channels)
     entry.refuse_implausible(batch.values)
-    try:
-        receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
-    except TwinGone:
-        raise Problem(404, f"no twin '{twin}' is registered") from None
+    receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
     if accepted.size:
         service.live.arrived(entry, accepted)
     report = _report(receipt, int(accepted.size))

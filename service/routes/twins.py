@@ -39,8 +39,7 @@ def _detail(twin: Twin) -> TwinDetail:
 async def register(service: Running, response: Response, body: Annotated[dict[str, Any], Body()]) -> TwinDetail:
     """Register a specification (201); the identical one again answers 200, another one under its id 409."""
     spec = load_spec(body)
-    twin, is_new = await service.database.write(twins.register, spec.twin, dump_spec(spec))
-    service.add_twin(twin)
+    twin, is_new = await service.register(spec.twin, dump_spec(spec))
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
     return _detail(twin)

@@ -8,6 +8,7 @@ import orjson
 
 from service.instants import format_instant, now_us
 from service.problems import Problem
+from service.store.gone import TwinGone
 
 KEPT = 200
 """Jobs of one kind that are kept per twin; older ones are forgotten."""
@@ -50,10 +51,13 @@ _SELECT = """SELECT id, twin, kind, state, progress, message, request, created_u
 
 def create(connection: sqlite3.Connection, twin: int, job: str, kind: str, request: dict[str, Any]) -> JobRow:
     """Queue a job."""
-    connection.execute(
-        "INSERT INTO job (id, twin, kind, state, request, created_us, message) VALUES (?, ?, ?, 'queued', ?, ?, ?)",
-        (job, twin, kind, orjson.dumps(request).decode(), now_us(), "waiting for a free worker"),
+    made = connection.execute(
+        """INSERT INTO job (id, twin, kind, state, request, created_us, message)
+           SELECT ?, id, ?, 'queued', ?, ?, ? FROM twin WHERE id = ?""",
+        (job, kind, orjson.dumps(request).decode(), now_us(), "waiting for a free worker", twin),
     )
+    if made.rowcount == 0:
+        raise TwinGone(f"twin {twin} is gone")
     connection.execute(
         """DELETE FROM job WHERE twin = ? AND kind = ? AND state NOT IN ('queued', 'running') AND number <=
            (SELECT max(number) FROM job) - ?""",

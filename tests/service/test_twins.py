@@ -1,5 +1,12 @@
 """Registering, listing, inspecting and deleting twins."""
 
+import asyncio
+
+import pytest
+
+from service.registry import Entry
+from service.store.gone import TwinGone
+from tests.service.conftest import SPEC
 from tests.service.harness import AppClient
 
 
@@ -36,3 +43,48 @@ def test_twins_survive_a_restart(make_client, spec: dict) -> None:
     second = make_client()
     assert second.get("/v1/twins/benchsat").json()["samples"] == 1
     assert second.post("/v1/twins", json=spec).status_code == 200
+
+
+def test_registering_while_the_same_twin_is_deleted_leaves_no_half_of_it(
+    client: AppClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    route = "/v1/twins/benchsat"
+    jobs = client.app.state.service.jobs
+    cancel = jobs.cancel_twin
+
+    async def slowly(twin: Entry) -> None:
+        await asyncio.sleep(0.1)
+        await cancel(twin)
+
+    monkeypatch.setattr(jobs, "cancel_twin", slowly)
+
+    async def rush() -> list[int]:
+        register = client.http.post("/v1/twins", json=SPEC)
+        answers = await asyncio.gather(client.http.delete(route), client.http.delete(route), register)
+        return [answer.status_code for answer in answers]
+
+    client.post("/v1/twins", json=SPEC)
+    assert client.portal.call(rush) == [204, 404, 201]
+    assert client.post(f"{route}/telemetry", json={"time": [1], "values": {"T_px": [290]}}).status_code == 200
+    assert client.get(f"{route}/residuals").status_code == 200
+    assert client.delete(route).status_code == 204
+
+
+def test_jobs_of_a_twin_that_was_deleted_meanwhile_are_refused(client: AppClient) -> None:
+    client.post("/v1/twins", json=SPEC)
+    service = client.app.state.service
+    entry = service.registry.get("benchsat")
+    client.delete("/v1/twins/benchsat")
+    with pytest.raises(TwinGone):
+        client.portal.call(service.jobs.start, entry, "calibration", {})
+
+
+def test_without_assimilation_there_is_an_archive_but_no_state(make_client) -> None:
+    client: AppClient = make_client(assimilate=False)
+    client.post("/v1/twins", json=SPEC)
+    route = "/v1/twins/benchsat"
+    assert client.post(f"{route}/telemetry", json={"time": [1], "values": {"T_px": [290]}}).json()["accepted"] == 1
+    for path in ("forecast?horizon_s=60", "residuals", "network"):
+        answer = client.get(f"{route}/{path}")
+        assert (answer.status_code, "TWIN_ASSIMILATE" in answer.json()["detail"]) == (409, True)
+    assert client.get(f"{route}/anomalies").json() == {"anomalies": []}
