@@ -1,10 +1,12 @@
 """The heat balance C dT/dt = sum of heats, evaluated at many points at once, with its exact derivatives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.network.jacobian import Jacobian, JacobianSum
 from twin_core.network.model import Network
 from twin_core.network.terms import Along, Entry
 
@@ -16,8 +18,8 @@ class Balance:
     Attributes
     ----------
     rate_K_per_s : (n_points, n_nodes)
-    jacobian_per_s : (n_points, n_nodes, n_nodes)
-        d rate / d temperature.
+    jacobian
+        d rate / d temperature; ``jacobian_per_s`` holds it as (n_points, n_nodes, n_nodes).
     heat_W : (n_points, n_nodes)
         Net heat into each node.
     capacity_J_per_K : (n_points, n_nodes)
@@ -28,12 +30,17 @@ class Balance:
     """
 
     rate_K_per_s: FloatArray
-    jacobian_per_s: FloatArray
+    jacobian: Jacobian
     heat_W: FloatArray
     capacity_J_per_K: FloatArray
     entry_free: IntArray
     entry_node: IntArray
     entry_series: FloatArray
+
+    @cached_property
+    def jacobian_per_s(self) -> FloatArray:
+        """The Jacobian as dense matrices."""
+        return self.jacobian.dense()
 
 
 def fill_boundaries(network: Network, values: FloatArray, boundaries_K: FloatArray) -> FloatArray:
@@ -74,23 +81,20 @@ def evaluate_balance(
         C_i dT_i/dt = sum of the terms' heats into node i.
     """
     n_points, n_nodes = along.temperatures_K.shape
+    along = replace(along, derivatives=derivatives)
     heat = np.zeros((n_points, n_nodes)) if extra_W is None else extra_W.astype(np.float64)
-    jacobian = np.zeros((n_points, n_nodes, n_nodes))
+    jacobian = JacobianSum(n_nodes)
     everywhere = tuple(range(n_nodes))
     entries: list[Entry] = []
     for term, index in zip(network.terms, network.term_indices, strict=True):
         part = term.evaluate(along, values[index])
+        jacobian.add(part)
         if len(part.nodes) == 1:  # slices, which cost a fraction of index arrays
-            node = part.nodes[0]
-            heat[:, node] += part.heat_W[:, 0]
-            jacobian[:, node, node] += part.d_temperature[:, 0, 0]
+            heat[:, part.nodes[0]] += part.heat_W[:, 0]
         elif part.nodes == everywhere:
             heat += part.heat_W
-            jacobian += part.d_temperature
         else:
-            nodes = np.asarray(part.nodes)
-            heat[:, nodes] += part.heat_W
-            jacobian[:, nodes[:, None], nodes[None, :]] += part.d_temperature
+            heat[:, np.asarray(part.nodes)] += part.heat_W
         if derivatives:
             entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
             entries += [
@@ -100,15 +104,15 @@ def evaluate_balance(
             ]
     capacity, slope, capacity_entries = _capacities(network, values, along)
     rate = heat / capacity
-    jacobian /= capacity[:, :, None]
-    diagonal = np.arange(n_nodes)
-    jacobian[:, diagonal, diagonal] -= rate * slope / capacity
+    moves = [node for node in range(n_nodes) if slope[:, node].any()] if network.capacities else []
+    correction = -rate * slope / capacity if moves else slope
+    slopes = jacobian.over(capacity, moves, correction)
     if not derivatives:
         nothing = np.zeros(0, dtype=np.int64)
-        return Balance(rate, jacobian, heat, capacity, nothing, nothing, np.zeros((0, n_points)))
+        return Balance(rate, slopes, heat, capacity, nothing, nothing, np.zeros((0, n_points)))
     rows = [Entry(e.item, e.node, e.series / capacity[:, e.node]) for e in entries]
     rows += [Entry(e.item, e.node, -e.series * rate[:, e.node] / capacity[:, e.node]) for e in capacity_entries]
-    return _free_entries(network, values, rate, jacobian, heat, capacity, rows)
+    return _free_entries(network, values, rate, slopes, heat, capacity, rows)
 
 
 def reading_offsets_K(network: Network, values: FloatArray, clock_s: FloatArray) -> FloatArray:
@@ -150,7 +154,7 @@ def _free_entries(
     network: Network,
     values: FloatArray,
     rate: FloatArray,
-    jacobian: FloatArray,
+    jacobian: Jacobian,
     heat: FloatArray,
     capacity: FloatArray,
     rows: list[Entry],

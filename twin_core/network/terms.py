@@ -29,6 +29,8 @@ class Along:
         Power in W (or percent), auxiliary channels in their own unit.
     sun_factor : (n_points,)
         (1 AU / Sun distance)^2; ones where no load is solar.
+    derivatives
+        Whether parameter derivatives are wanted: a term for which they are dear may leave them out where not.
     """
 
     time_s: FloatArray
@@ -36,6 +38,7 @@ class Along:
     boundaries_K: FloatArray
     inputs: Mapping[str, FloatArray]
     sun_factor: FloatArray
+    derivatives: bool = True
 
 
 class Entry(NamedTuple):
@@ -159,17 +162,19 @@ class Conductors:
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
         """Evaluate every conductor; the Jacobian is the negative weighted graph Laplacian (paper A, eq. 1)."""
-        first, second = (list(side) for side in zip(*self.pairs, strict=True))
+        first, second = np.array(self.pairs).T
+        laplacian = np.zeros((self.n_nodes, self.n_nodes))
+        np.add.at(laplacian, (first, second), -values)
+        laplacian += laplacian.T
+        np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
         temperatures = along.temperatures_K
-        difference = temperatures[:, second] - temperatures[:, first]
-        incidence = np.zeros((len(self.pairs), self.n_nodes))
-        rows = np.arange(len(self.pairs))
-        incidence[rows, first], incidence[rows, second] = 1.0, -1.0
-        heat = (difference * values) @ incidence
-        laplacian = incidence.T @ (values[:, None] * incidence)
+        heat = (
+            temperatures[:, :1] - temperatures
+        ) @ laplacian  # differences, so that equal temperatures exchange nothing
         entries = []
-        for edge, (a, b) in enumerate(self.pairs):
-            entries += [Entry(edge, a, difference[:, edge]), Entry(edge, b, -difference[:, edge])]
+        for edge, (a, b) in enumerate(self.pairs if along.derivatives else ()):
+            difference = temperatures[:, b] - temperatures[:, a]
+            entries += [Entry(edge, a, difference), Entry(edge, b, -difference)]
         return Heat(tuple(range(self.n_nodes)), heat, -laplacian[None], entries)
 
 
@@ -209,14 +214,15 @@ class SinkRadiation:
         """Evaluate the radiation."""
         temperature = along.temperatures_K[:, self.node]
         sink = along.boundaries_K[:, self.boundary]
-        unit = STEFAN_BOLTZMANN_W_PER_M2_K4 * (sink**4 - temperature**4)
+        square, sink_square = temperature * temperature, sink * sink  # powers of floats are dear
+        unit = STEFAN_BOLTZMANN_W_PER_M2_K4 * (sink_square * sink_square - square * square)
         slope = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * values[0]
         return Heat(
             (self.node,),
             (values[0] * unit)[:, None],
-            (-slope * temperature**3)[:, None, None],
+            (-slope * square * temperature)[:, None, None],
             [Entry(0, self.node, unit)],
-            [Entry(self.boundary, self.node, slope * sink**3)],
+            [Entry(self.boundary, self.node, slope * sink_square * sink)],
         )
 
 

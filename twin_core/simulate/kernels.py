@@ -6,7 +6,8 @@ The scheme is the two-stage, stiffly accurate, L-stable SDIRK method of second o
     z = x + (1 - gamma)/gamma (Y - x) + gamma h f(t + h, z)
 
 With f linearised about a guess, f(Y) = g + J Y, each stage is one solve with I - gamma h J. L-stability keeps a rollout
-bounded whatever step the telemetry forces; inputs held over a step are seen exactly.
+bounded whatever step the telemetry forces; inputs held over a step are seen exactly. The Jacobian of a network hardly
+moves: conductances are the same everywhere, radiation changes some diagonal entries. One factorisation serves many steps.
 """
 
 import numpy as np
@@ -15,6 +16,12 @@ from numba import njit
 from twin_core._typing import FloatArray, IntArray
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
+
+LINEAR_K = 1e-10
+"""Each linear solve is iterated to this, a thousandth of what a rollout converges to."""
+
+N_SOLVES = 4
+"""Iterations after which a new inverse is cheaper."""
 
 
 @njit(cache=True, nogil=True)
@@ -76,17 +83,72 @@ def _prepare(lu: FloatArray, pivots: IntArray, scaled_step: float, jacobian: Flo
 
 
 @njit(cache=True, nogil=True)
+def _invert(inverse: FloatArray, scaled_step: float, jacobian: FloatArray) -> None:
+    """Replace ``inverse`` by that of I - gamma h J."""
+    n = jacobian.shape[0]
+    lu, pivots = np.empty((n, n)), np.empty(n, dtype=np.int64)
+    _prepare(lu, pivots, scaled_step, jacobian)
+    inverse[:] = np.eye(n)
+    _solve_columns(lu, pivots, inverse)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _multiply(matrix: FloatArray, column: FloatArray, out: FloatArray) -> None:
+    """Write matrix @ column to ``out``."""
+    for i in range(matrix.shape[0]):
+        total = 0.0
+        for j in range(matrix.shape[1]):
+            total += matrix[i, j] * column[j]
+        out[i] = total
+
+
+@njit(cache=True, nogil=True)
+def _solve_near(
+    inverse: FloatArray, row: IntArray, column: IntArray, moved: FloatArray, right: FloatArray, out: FloatArray
+) -> bool:
+    """Solve (A - D) z = r by A z' = r + D z, A by its inverse and D by its entries; False where that takes long."""
+    _multiply(inverse, right, out)
+    before, now = np.zeros(right.size), np.empty(right.size)
+    for _ in range(N_SOLVES):
+        now[:] = 0.0
+        for e in range(row.size):
+            now[row[e]] += moved[e] * out[column[e]]
+        if np.abs(now - before).max() < LINEAR_K:
+            return True
+        before[:] = now
+        _multiply(inverse, right + now, out)
+    return False
+
+
+@njit(cache=True, nogil=True)
 def march(
-    step_s: FloatArray, jacobian: FloatArray, constant: FloatArray, start: FloatArray, gamma: float
+    step_s: FloatArray,
+    constant: FloatArray,
+    row: IntArray,
+    column: IntArray,
+    moving: FloatArray,
+    rate: FloatArray,
+    stages: FloatArray,
+    start: FloatArray,
+    gamma: float,
 ) -> FloatArray:
-    """Advance the linearised balance.
+    """Advance the balance linearised about some stage states.
+
+    One inverse serves as long as the step stays and the moving entries of the Jacobian stay near: what they have moved
+    by is iterated, each iteration as dear as a product.
 
     Parameters
     ----------
     step_s : (n_steps,)
-    jacobian : (n_steps, 2, n, n)
-    constant : (n_steps, 2, n)
-        g of f(Y) = g + J Y.
+    constant : (n, n)
+        The part of the Jacobian that no stage changes.
+    row, column : (n_entries,)
+    moving : (n_steps, 2, n_entries)
+        What each stage adds to it, and where.
+    rate : (n_steps, 2, n)
+        f at ``stages``.
+    stages : (n_steps, 2, n)
+        Where the balance was linearised.
     start : (n,)
     gamma
         The scheme's constant.
@@ -98,21 +160,30 @@ def march(
     """
     n_steps, n = step_s.size, start.size
     out = np.empty((n_steps, 2, n))
-    lu = np.empty((n, n))
-    pivots = np.empty(n, dtype=np.int64)
+    inverse, inverted_at = np.empty((n, n)), np.nan
+    reference = np.zeros(row.size)
     state = start.copy()
-    column = np.empty((n, 1))
+    right, change = np.empty(n), np.empty(n)
     ratio = (1.0 - gamma) / gamma
     for k in range(n_steps):
         scaled = gamma * step_s[k]
         for stage in range(2):
-            _prepare(lu, pivots, scaled, jacobian[k, stage])
             for i in range(n):
                 before = state[i] if stage == 0 else state[i] + ratio * (out[k, 0, i] - state[i])
-                column[i, 0] = before + scaled * constant[k, stage, i]
-            _solve_columns(lu, pivots, column)
+                right[i] = before + scaled * rate[k, stage, i] - stages[k, stage, i]
+            here = moving[k, stage]
+            near = scaled == inverted_at and _solve_near(
+                inverse, row, column, scaled * (here - reference), right, change
+            )
+            if not near:
+                jacobian = constant.copy()
+                for e in range(row.size):
+                    jacobian[row[e], column[e]] += here[e]
+                _invert(inverse, scaled, jacobian)
+                reference[:], inverted_at = here, scaled
+                _multiply(inverse, right, change)
             for i in range(n):
-                out[k, stage, i] = column[i, 0]
+                out[k, stage, i] = stages[k, stage, i] + change[i]
         for i in range(n):
             state[i] = out[k, 1, i]
     return out

@@ -101,18 +101,30 @@ def _newton(
     change_before = np.inf
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
         balance = balance_along(network, values, forcing, stages, first, last)
-        jacobian = balance.jacobian_per_s.reshape(n_steps, 2, n_nodes, n_nodes)
-        constant = balance.rate_K_per_s.reshape(n_steps, 2, n_nodes) - np.einsum("ksij,ksj->ksi", jacobian, stages)
-        solved = march(forcing.step_s[first:last], jacobian, constant, start_K, GAMMA)
-        if not np.isfinite(solved).all():
-            return None
+        jacobian, rate = balance.jacobian, balance.rate_K_per_s.reshape(n_steps, 2, n_nodes)
+        solved = march(
+            forcing.step_s[first:last],
+            jacobian.constant,
+            jacobian.row,
+            jacobian.column,
+            jacobian.moving.reshape(n_steps, 2, jacobian.row.size),
+            rate,
+            stages,
+            start_K,
+            GAMMA,
+        )
         change = float(np.abs(solved - stages).max())
-        # A step across a kink may swing from one side to the other: half the way ends that.
-        swings = n_steps == 1 and iteration > 8 and change >= TOLERANCE_K
-        stages = np.clip(0.5 * (solved + stages) if swings else solved, *LIMIT_K)
-        if change < TOLERANCE_K:
-            inside = (solved >= LIMIT_K[0]).all() and (solved <= LIMIT_K[1]).all()
+        if not np.isfinite(change):
+            return None
+        inside = solved.min() >= LIMIT_K[0] and solved.max() <= LIMIT_K[1]
+        # Newton's method contracts: the next change is no larger than this one times the last contraction (Hairer and
+        # Wanner 1996, section IV.8), and the pass that would only confirm it is spared.
+        contraction = min(1.0, change / change_before) if iteration > 0 else 1.0
+        if change * contraction < TOLERANCE_K:
             return solved if inside else None
+        # A step across a kink may swing from one side to the other: half the way ends that.
+        stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved
+        stages = stages if inside else np.clip(stages, *LIMIT_K)
         if iteration > 8 and change > change_before and n_steps > 1:
             return None
         change_before = change

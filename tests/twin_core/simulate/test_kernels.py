@@ -1,6 +1,7 @@
 """The compiled recursions against the scheme written down with dense solves."""
 
 import numpy as np
+import pytest
 
 from twin_core.simulate.kernels import GAMMA, march, march_sensitivities
 
@@ -25,15 +26,45 @@ def problem(n: int, n_steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     )
 
 
+def marched(step: np.ndarray, jacobian: np.ndarray, constant: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """March with every entry moving, about zero."""
+    n_steps, _, n, _ = jacobian.shape
+    row, column = (index.ravel() for index in np.indices((n, n)))
+    moving = jacobian.reshape(n_steps, 2, n * n)
+    return march(step, np.zeros((n, n)), row, column, moving, constant, np.zeros((n_steps, 2, n)), start, GAMMA)
+
+
 def test_march_is_the_scheme() -> None:
     for n in (1, 2, 5):
         step, jacobian, constant, start = problem(n, 12)
-        found = march(step, jacobian, constant, start, GAMMA)
+        found = marched(step, jacobian, constant, start)
         state = start
         for k in range(step.size):
             stages = scheme(step[k], jacobian[k], constant[k], state)
             np.testing.assert_allclose(found[k], stages, rtol=1e-9, atol=1e-9 * np.abs(stages).max())
             state = stages[1]
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.3, 30.0])
+def test_march_about_any_states_with_a_few_moving_entries_is_the_scheme(size: float) -> None:
+    """One inverse for many steps, renewed where the step or the entries change too much, gives what dense solves give."""
+    rng = np.random.default_rng(3)
+    n, n_steps = 6, 40
+    step = np.repeat([20.0, 20.5, 60.0, 20.0], 10)
+    fixed = -np.diag(rng.uniform(1e-4, 1e-1, n)) + rng.uniform(0.0, 1e-3, (n, n))
+    row, column = np.array([0, 2, 2, 5]), np.array([0, 2, 3, 1])
+    moving = -size * rng.uniform(0.0, 1e-2, (n_steps, 2, 4))
+    about, rate = rng.normal(300.0, 10.0, (n_steps, 2, n)), rng.normal(0.0, 1e-2, (n_steps, 2, n))
+    jacobian = np.broadcast_to(fixed, (n_steps, 2, n, n)).copy()
+    for e in range(4):
+        jacobian[:, :, row[e], column[e]] += moving[:, :, e]
+    state = rng.normal(300.0, 10.0, n)
+    found = march(step, fixed, row, column, moving, rate, about, state, GAMMA)
+    for k in range(n_steps):
+        constant = rate[k] - np.einsum("sij,sj->si", jacobian[k], about[k])
+        stages = scheme(step[k], jacobian[k], constant, state)
+        np.testing.assert_allclose(found[k], stages, rtol=0.0, atol=1e-8)
+        state = stages[1]
 
 
 def test_sensitivities_are_the_scheme_of_their_own_equation() -> None:
@@ -63,5 +94,5 @@ def test_sensitivities_are_the_scheme_of_their_own_equation() -> None:
 def test_the_scheme_is_stiffly_accurate_and_damps_at_infinity() -> None:
     """With f = -rate (x - target), rate h -> infinity, one step lands on the target."""
     rate, target = 1e12, 7.0
-    found = march(np.ones(1), np.full((1, 2, 1, 1), -rate), np.full((1, 2, 1), rate * target), np.array([300.0]), GAMMA)
+    found = marched(np.ones(1), np.full((1, 2, 1, 1), -rate), np.full((1, 2, 1), rate * target), np.array([300.0]))
     np.testing.assert_allclose(found[0, 1], target, atol=1e-8)
