@@ -44,6 +44,7 @@ def approach(
     *,
     tolerance: float = TOLERANCE,
     rounds: int = MAX_ROUNDS,
+    stands_for: float = 1.0,
 ) -> Optimum:
     """Return an optimum in which noise and misfit are weighed together.
 
@@ -57,6 +58,8 @@ def approach(
         A round ends when a step lowers the cost by less than this share.
     rounds
         Rounds at most.
+    stands_for
+        Readings of the full record that each one of a thinned record stands for, beside priors that stand for themselves.
 
     Returns
     -------
@@ -71,7 +74,7 @@ def approach(
         return best
     iterations, before = 0, misfit_K(problem, fit)
     for _ in range(rounds):
-        noise = np.hypot(problem.noise_K, CAUTION * before)
+        noise = np.hypot(problem.noise_K, CAUTION * before) / np.sqrt(stands_for)
         weighed = replace(problem, noise_K=noise)
         best = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance)
         x, fit, iterations = best.unknowns, best.fit, iterations + best.iterations

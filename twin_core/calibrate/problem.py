@@ -134,6 +134,11 @@ class Problem:
         return int(self.network.parameters.free_index.size)
 
     @property
+    def n_samples(self) -> int:
+        """Number of samples of all segments."""
+        return sum(segment.record.time_s.size for segment in self.segments)
+
+    @property
     def n_nodes(self) -> int:
         """Number of states."""
         return len(self.network.nodes)
@@ -233,7 +238,7 @@ class Problem:
             observed = self.network.sensor_node[wanted]
             parts = sensitivities(self.network, values, segment.forcing, path, starts, self.n_free, observed)
             for samples, block in parts:
-                self._add_reading_derivatives(values, segment.record.time_s, samples, wanted, block)
+                self._add_reading_derivatives(values, segment.record.clock_s, samples, wanted, block)
                 yield i, samples, block
 
     def jacobian_blocks(self, unknowns: FloatArray, fit: Fit, sensors: IntArray | None = None) -> list[FloatArray]:
@@ -246,11 +251,11 @@ class Problem:
     def with_reading_derivatives(self, values: FloatArray, segment: Segment, block: FloatArray) -> FloatArray:
         """Return sensitivities with the derivatives of sensor faults added, (n_samples, n_sensors, n_columns)."""
         everything = np.arange(self.network.sensor_node.size)
-        self._add_reading_derivatives(values, segment.record.time_s, slice(None), everything, block)
+        self._add_reading_derivatives(values, segment.record.clock_s, slice(None), everything, block)
         return block
 
     def _add_reading_derivatives(
-        self, values: FloatArray, time_s: FloatArray, samples: slice, sensors: IntArray, block: FloatArray
+        self, values: FloatArray, clock_s: FloatArray, samples: slice, sensors: IntArray, block: FloatArray
     ) -> None:
         """Add the derivatives of sensor faults to the sensitivities of some samples and sensors, in place."""
         parameters = self.network.parameters
@@ -258,7 +263,7 @@ class Problem:
         at = parameters.at_values(values) if self.network.readings else parameters
         for term in self.network.readings:
             index = self.network.term_index(term)
-            part = term.evaluate(time_s, values[index])
+            part = term.evaluate(clock_s, values[index])
             for column in np.flatnonzero(sensors == part.sensor):
                 for item, series in part.d_values:
                     if int(index[item]) in position:
@@ -275,15 +280,16 @@ class Problem:
         for i, samples, block in self.jacobian_stretches(unknowns, fit):
             residual = residuals[i][samples]
             valid = np.isfinite(residual)
-            weight = np.broadcast_to(1.0 / self.noise_K, residual.shape)[valid]
+            scaled = np.where(valid, residual, 0.0) / self.noise_K
+            weight = valid / self.noise_K
             if np.isfinite(self.huber):  # iteratively reweighted least squares
-                weight = weight * np.sqrt(
-                    np.minimum(1.0, self.huber / np.maximum(np.abs(residual[valid] * weight), 1e-12))
-                )
-            rows = block[valid] * weight[:, None]
+                shrunk = np.sqrt(np.minimum(1.0, self.huber / np.maximum(np.abs(scaled), 1e-12)))
+                scaled, weight = scaled * shrunk, weight * shrunk
+            block *= weight[:, :, None]
+            rows = block.reshape(-1, block.shape[2])
             columns = np.r_[0 : self.n_free, self.start_columns(i)]
             hessian[np.ix_(columns, columns)] += rows.T @ rows
-            gradient[columns] -= rows.T @ (residual[valid] * weight)
+            gradient[columns] -= rows.T @ scaled.ravel()
         return hessian, gradient
 
     def with_network(self, network: Network) -> "Problem":

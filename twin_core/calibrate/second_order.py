@@ -187,7 +187,7 @@ def fit_trajectories(
     found = []
     for trial, start in enumerate(starts):
         progress(0.1 + 0.5 * trial / len(starts), "fitting trajectories")
-        found.append(approach(coarse, start))
+        found.append(approach(coarse, start, stands_for=problem.n_samples / coarse.n_samples))
     progress(0.6, "fitting all samples")
     best = min(found, key=lambda o: coarse.solve(o.unknowns, o.fit).cost)
     if coarse is not problem and best.status != "no_solution":

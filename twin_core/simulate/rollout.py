@@ -181,8 +181,8 @@ def sensitivities(
     """
     state = start_columns.astype(np.float64)
     n_nodes = state.shape[0]
-    for first in range(0, max(forcing.n_steps, 1), 8 * STRETCH):
-        last = min(first + 8 * STRETCH, forcing.n_steps)
+    for first in range(0, max(forcing.n_steps, 1), 2 * STRETCH):
+        last = min(first + 2 * STRETCH, forcing.n_steps)
         low = int(np.searchsorted(forcing.sample_step, first, side="left" if first == 0 else "right"))
         high = int(np.searchsorted(forcing.sample_step, last, side="right"))
         balance = balance_along(

@@ -9,6 +9,7 @@ from tests.helpers import active_effect, central_difference, every_term_network
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem, build_problem, excluded
 from twin_core.effects import REGISTRY
+from twin_core.effects.sensor_drift import SensorDrift
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import Interval
 from twin_core.telemetry import Record
@@ -37,7 +38,16 @@ def problem(*names: str) -> Problem:
 
 @pytest.mark.parametrize("names", [(), ("hidden_mass",), ("sensor_lag",), ("missing_conductor", "input_power_law")])
 def test_the_gradient_is_that_of_the_cost(names: tuple[str, ...]) -> None:
-    p = problem(*names)
+    check_gradient(problem(*names))
+
+
+def test_the_gradient_of_a_drift_counts_from_its_instant() -> None:
+    began = {"t0_s": orbit(20, 1).epoch_s, "dated": True}
+    network = every_term_network([SensorDrift({"sensor": "T_a"}, {"d_K_per_s": 1e-4}, began)])
+    check_gradient(build_problem(network, [orbit(20, 1)], np.array([0.5, 0.8]), 100.0))
+
+
+def check_gradient(p: Problem) -> None:
     unknowns = p.start()
     unknowns[: p.n_free] += 0.05
     _, gradient = p.normal_equations(unknowns, p.solve(unknowns))
