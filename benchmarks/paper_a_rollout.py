@@ -121,7 +121,7 @@ def _repeated(record: Record, n_times: int) -> Record:
 
 
 def _random_problem(n_nodes: int, n_edges: int, n_times: int) -> Problem:
-    """Return a connected random network under a switching load."""
+    """Return a connected random network under a switching load, every fifth node radiating to space."""
     rng = np.random.default_rng(n_nodes)
     pairs = {(i, i + 1) for i in range(n_nodes - 1)}
     while len(pairs) < n_edges:
@@ -132,9 +132,11 @@ def _random_problem(n_nodes: int, n_edges: int, n_times: int) -> Problem:
     spec = load_spec(
         {
             "twin": "random",
+            "boundaries": {"space": {"value_K": 3.0}},
             "channels": {f"T{i}": kelvin for i in range(n_nodes)} | {"Q": {"kind": "power", "unit": "W"}},
             "nodes": [{"id": n, "sensor": f"T{i}", "capacity_J_per_K": {"guess": 5e3}} for i, n in enumerate(names)],
             "conductors": [{"between": [names[a], names[b]]} | one for a, b in sorted(pairs)],
+            "radiators": [{"node": n, "emissivity": 0.8, "area_m2": 0.05, "sink": "space"} for n in names[::5]],
             "loads": [{"channel": "Q", "node": "n0"}],
         }
     )
