@@ -35,7 +35,7 @@ check: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
 
-bench-paper-a: $(STAMP)
+bench-paper-a: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_a
 
 bench-service: $(STAMP)

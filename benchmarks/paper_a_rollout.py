@@ -1,14 +1,16 @@
 """Rollouts beside torchdiffeq and SciPy; how their cost grows with samples, nodes and conductors, and their memory."""
 
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
-from benchmarks.markdown import markdown_table
+from benchmarks.markdown import TABLES, markdown_table
 from benchmarks.paper_a_cases import simulations
 from benchmarks.paper_a_speed import seconds
 from twin_core._typing import FloatArray
@@ -83,35 +85,52 @@ def _field(problem: Problem) -> tuple[FloatArray, Callable[[float, FloatArray], 
     return matrix, rate
 
 
+SAMPLES = (1_000, 10_000, 100_000, 1_000_000)
+SIZES = ((25, 250), (50, 500), (100, 1000), (200, 2000))
+"""Lengths of records, and nodes with conductors, whose rollouts are timed."""
+
+
 def growth() -> str:
     """Return how the cost of a rollout grows with samples, nodes and conductors, and memory at a million samples."""
-    rows = []
-    record = simulations()["combined", "A"].record
-    network = build_network(paper_spec())
-    for n in (1_000, 10_000, 100_000, 1_000_000):
-        long = _repeated(record, n)
-        problem = build_problem(network, [long], np.full(9, 0.1), np.inf)
-        start, forcing = problem.segments[0].start_prior_K, problem.segments[0].forcing
-        taken = seconds(
-            lambda forcing=forcing, start=start: rollout(network, network.parameters.values, start, forcing), 1
-        )
-        rows.append([f"{n:,} samples, 9 nodes, 28 conductors", f"{taken:.3f}", f"{1e6 * taken / n:.1f}"])
-        print(rows[-1], flush=True)
-    for n_nodes, n_edges in ((25, 250), (50, 500), (100, 1000), (200, 2000)):
-        problem = _random_problem(n_nodes, n_edges, 1000)
-        start, forcing, net = problem.segments[0].start_prior_K, problem.segments[0].forcing, problem.network
-        taken = seconds(lambda p=net, f=forcing, s=start: rollout(p, p.parameters.values, s, f), 2)
-        rows.append(
-            [
-                f"1,000 samples, {n_nodes} nodes, {n_edges} conductors",
-                f"{taken:.3f}",
-                f"{1e6 * taken / (n_nodes + n_edges):.0f}",
-            ]
-        )
-        print(rows[-1], flush=True)
+    record, network = simulations()["combined", "A"].record, build_network(paper_spec())
+    long = (build_problem(network, [_repeated(record, n)], np.full(9, 0.1), np.inf) for n in SAMPLES)
+    by_samples = [_rollout_seconds(problem, 1 if n > 1e5 else 3) for n, problem in zip(SAMPLES, long, strict=True)]
+    by_size = [_rollout_seconds(_random_problem(nodes, edges, 1000), 3) for nodes, edges in SIZES]
+    rows = [
+        [f"{n:,} samples, 9 nodes, 28 conductors", f"{taken:.4f}", f"{1e6 * taken / n:.1f}"]
+        for n, taken in zip(SAMPLES, by_samples, strict=True)
+    ] + [
+        [f"1,000 samples, {nodes} nodes, {edges} conductors", f"{taken:.4f}", f"{1e6 * taken / (nodes + edges):.1f}"]
+        for (nodes, edges), taken in zip(SIZES, by_size, strict=True)
+    ]
     header = ["rollout", "seconds", "µs per sample, or per node and conductor"]
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return f"## Growth\n\n{markdown_table(header, rows)}\nPeak memory of this process until here: {peak:.2f} GiB.\n"
+    figure = Figure((9.0, 3.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    samples = _growth(left, "samples, 9 nodes", SAMPLES, by_samples)
+    size = _growth(right, "nodes and conductors, 1000 samples", [nodes + edges for nodes, edges in SIZES], by_size)
+    figure.savefig(TABLES / "paper_a_growth.svg", metadata={"Date": None})
+    return (
+        f"## Growth\n\n{markdown_table(header, rows)}\n![Cost of a rollout](paper_a_growth.svg)\n\nSeconds grow with the"
+        f" power {samples:.2f} of the samples and {size:.2f} of nodes and conductors together (least squares of the"
+        f" logarithms). Peak memory of this process until here: {peak:.2f} GiB.\n"
+    )
+
+
+def _rollout_seconds(problem: Problem, repeats: int) -> float:
+    """Return the seconds of one rollout of a problem's first segment."""
+    network, segment = problem.network, problem.segments[0]
+    return seconds(lambda: rollout(network, network.parameters.values, segment.start_prior_K, segment.forcing), repeats)
+
+
+def _growth(axes: Axes, of: str, sizes: Sequence[int], taken: Sequence[float]) -> float:
+    """Draw seconds over a size and return the power with which they grow."""
+    power, factor = np.polyfit(np.log(sizes), np.log(taken), 1)
+    axes.loglog(sizes, taken, "o", label="measured")
+    axes.loglog(sizes, np.exp(factor) * np.asarray(sizes, dtype=float) ** power, label=f"power {power:.2f}")
+    axes.set(xlabel=of, ylabel="seconds of a rollout")
+    axes.legend()
+    return float(power)
 
 
 def _repeated(record: Record, n_times: int) -> Record:

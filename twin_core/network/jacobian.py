@@ -63,7 +63,7 @@ class JacobianSum:
         correction : (n_points, n_nodes)
             What the capacity's slope adds to their diagonal.
         """
-        constant = self.constant / capacity[0][:, None]
+        constant = self.constant / (capacity[0] if len(capacity) else np.ones(capacity.shape[1]))[:, None]
         constant[list(movable)] = 0.0
         entries = [(row, column, series / capacity[:, row]) for row, column, series in self.moving]
         for node in movable:
