@@ -16,10 +16,14 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def commit() -> str:
-    """Return the short commit that is measured, marked where the tree differs from it."""
-    command = ["git", "-C", str(TABLES), "describe", "--always", "--dirty"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    return done.stdout.strip() or "unknown commit"
+    """Return the short commit that is measured, marked where the tree differs from it in more than saved tables."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(TABLES.parents[1]), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/tables")
+    return (git("rev-parse", "--short", "HEAD") or "unknown commit") + ("-dirty" if changed else "")
 
 
 def save_table(name: str, title: str, table: str, module: str, note: str = "") -> Path:
