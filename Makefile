@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 
-.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b bench-service serve clean
+.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b bench-loop bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -37,6 +37,10 @@ bench: $(STAMP)
 
 bench-paper-a: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_a
+
+bench-loop: $(BENCH)
+	$(BIN)/python -m benchmarks.loop
+	$(BIN)/python -m benchmarks.loop_rivals
 
 bench-service: $(STAMP)
 	$(BIN)/python -m benchmarks.service

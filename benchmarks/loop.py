@@ -1,6 +1,6 @@
 """The closed loop over the suite: is the right effect named, is it listed, and is a healthy spacecraft left alone?
 
-``python -m benchmarks.loop [--groups network fem clean outside] [--effects NAME ...] [--processes 2] [--results FILE]`` runs the
+``python -m benchmarks.loop [--groups network fem clean outside] [--networks N] [--clean N] [--effects NAME ...] [--processes 2] [--results FILE]`` runs the
 cases, appends one line of JSON per case to FILE (cases already in it are not run again), and saves ``benchmarks/tables/loop.md``.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.loop_cases import Task, suite
+from benchmarks.loop_cases import GROUPS, N_CLEAN, N_NETWORKS, Task, suite
 from benchmarks.loop_table import Row, save_tables
 from benchmarks.network_cases import Case
 from twin_core.calibrate.second_order import fit_network, to_model
@@ -146,12 +146,15 @@ def _values(where: dict[str, Any]) -> str:
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--groups", nargs="+", default=["network", "fem", "clean", "outside"])
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
+    parser.add_argument("--networks", type=int, default=N_NETWORKS, help="networks per effect")
+    parser.add_argument("--clean", type=int, default=N_CLEAN, help="clean records")
     parser.add_argument("--effects", nargs="+", help="only these effects")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    tasks = [t for t in suite(tuple(arguments.groups)) if not arguments.effects or t.effect in arguments.effects]
+    tasks = suite(arguments.groups, n_networks=arguments.networks, n_clean=arguments.clean)
+    tasks = [task for task in tasks if not arguments.effects or task.effect in arguments.effects]
     rows = run_all(tasks, arguments.results, arguments.processes, run, line)
     if not arguments.effects:
         save_tables(rows)

@@ -1,5 +1,6 @@
 """The suite of the closed loop: which spacecraft hide what. Every case is drawn from its seed and nothing else."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 
@@ -8,9 +9,10 @@ from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_cases import Case, network_case
 from benchmarks.outside_vocabulary import OUTSIDE
 
-N_NETWORKS = int(__import__("os").environ.get("NNET", "5"))
+GROUPS = ("network", "fem", "clean", "outside")
+N_NETWORKS = 5
 N_FEM = 1
-N_CLEAN = int(__import__("os").environ.get("NCLEAN", "300"))
+N_CLEAN = 300
 N_OUTSIDE = 2
 LEAST_TRACE = 2.0
 """Effects that move the readings of the training part less than this, in units of their noise, are drawn again."""
@@ -56,14 +58,14 @@ class Task:
         return next(case for case in drawn if case.trace > LEAST_TRACE)
 
 
-def suite(groups: tuple[str, ...] = ("network", "fem", "clean", "outside")) -> list[Task]:
-    """Return the tasks of the suite's groups."""
+def suite(groups: Sequence[str] = GROUPS, *, n_networks: int = N_NETWORKS, n_clean: int = N_CLEAN) -> list[Task]:
+    """Return the tasks of the suite's groups: so many networks per effect, and so many clean records."""
     every = {
         "network": [
-            Task("network", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(N_NETWORKS)
+            Task("network", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(n_networks)
         ],
         "fem": [Task("fem", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(FEM_EFFECTS) for k in range(N_FEM)],
-        "clean": [Task("clean", None, FIRST_SEED + k) for k in range(N_CLEAN)],
+        "clean": [Task("clean", None, FIRST_SEED + k) for k in range(n_clean)],
         "outside": [
             Task("outside", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(OUTSIDE) for k in range(N_OUTSIDE)
         ],
