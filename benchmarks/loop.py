@@ -1,7 +1,8 @@
 """The closed loop over the suite: is the right effect named, is it listed, and is a healthy spacecraft left alone?
 
-``python -m benchmarks.loop [--groups network fem clean outside] [--networks N] [--clean N] [--effects NAME ...] [--processes 2] [--results FILE]`` runs the
-cases, appends one line of JSON per case to FILE (cases already in it are not run again), and saves ``benchmarks/tables/loop.md``.
+``python -m benchmarks.loop [--groups ...] [--networks N] [--clean N] [--effects NAME ...] [--processes 2] [--results FILE]`` runs
+the cases, appends one line of JSON per case to FILE (cases already in it are not run again), and saves
+``benchmarks/tables/loop.md``.
 """
 
 import argparse
