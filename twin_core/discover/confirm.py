@@ -85,6 +85,12 @@ class Trial:
         """Sum of squared weighted errors over the end of the training record, predicted by a fit to its beginning."""
         return forward_error(self.calibration)
 
+    @cached_property
+    def misfit_share(self) -> float:
+        """Misfit over noise, rms over sensors: how much the open-loop model leaves beyond the sensors' own noise."""
+        models, noise = self.calibration.whitener.models, self.calibration.problem.noise_K
+        return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
+
     @property
     def n_samples(self) -> int:
         """Number of readings that took part."""

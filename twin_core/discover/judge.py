@@ -23,6 +23,9 @@ other by as much as an event that it has not seen costs."""
 LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
+UNEXPLAINED_SHARE = 3.0
+"""Misfit over noise beyond which a record without a supported effect is called unexplained."""
+
 UNTOLD_STD = 1.0
 """Relative deviation beyond which a quantity is not told: a mass of any size is a boundary, not a mass."""
 

@@ -9,10 +9,10 @@ import numpy as np
 from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import Calibration, fit_network, to_model
+from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
-from twin_core.discover.judge import Search
+from twin_core.discover.judge import UNEXPLAINED_SHARE, Search
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
@@ -21,9 +21,6 @@ from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
-
-UNEXPLAINED_SHARE = 3.0
-"""Misfit over noise beyond which a record without a supported effect is called unexplained."""
 
 
 @dataclass(frozen=True)
@@ -130,11 +127,5 @@ def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    unexplained = misfit_share(found.base.calibration) > UNEXPLAINED_SHARE
+    unexplained = found.base.misfit_share > UNEXPLAINED_SHARE
     return "unexplained" if unexplained else "no_effect_supported"
-
-
-def misfit_share(calibration: Calibration) -> float:
-    """Return the rms over sensors of misfit over noise: how much a model leaves beyond the sensors' own noise."""
-    models, noise = calibration.whitener.models, calibration.problem.noise_K
-    return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
