@@ -20,6 +20,9 @@ LITTLE_LEARNED = 0.9
 IDENTIFIED_STD = 1.0 / 3.0
 """A parameter whose relative standard deviation is below this is identified: signal-to-noise ratio of at least 3."""
 
+TOGETHER = 0.5
+"""Parameters of a weak direction are told together where their estimates are correlated by more than this."""
+
 
 def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     """Return names of free parameters that the data cannot see.
@@ -74,8 +77,11 @@ def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str |
         return None
     weights = directions[:, -1]
     strongest = np.argsort(-np.abs(weights))[:3]
-    names = [parameters.free_names[logarithmic[k]] for k in strongest if abs(weights[k]) > 0.2]
-    if len(names) < 2:  # one parameter that the data do not tell is said elsewhere
+    std = np.sqrt(np.maximum(np.diag(block), 1e-300))
+    correlation = np.abs(block / np.outer(std, std)) - np.eye(std.size)
+    heavy = [k for k in strongest if abs(weights[k]) > 0.2]
+    names = [parameters.free_names[logarithmic[k]] for k in heavy if correlation[k, heavy].max() > TOGETHER]
+    if len(names) < 2:  # parameters that the data do not tell at all are said elsewhere, one by one
         return None
     factor = float(np.exp(min(np.sqrt(spread[-1]), 20.0)))
     return f"the data tell {' and '.join(names)} only together: they may move by a factor {factor:.3g} as one"

@@ -161,7 +161,10 @@ class Conductors:
     borrows: tuple[str, ...] = ()
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
-        """Evaluate every conductor; the Jacobian is the negative weighted graph Laplacian (paper A, eq. 1)."""
+        """Evaluate every conductor; the Jacobian is the negative weighted graph Laplacian (paper A, eq. 1).
+
+        Symmetric and without row sums, it keeps the heat content and lets T'CT/2 fall (eqs. 5 to 11).
+        """
         first, second = np.array(self.pairs).T
         laplacian = np.zeros((self.n_nodes, self.n_nodes))
         np.add.at(laplacian, (first, second), -values)

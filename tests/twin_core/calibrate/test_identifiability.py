@@ -45,6 +45,14 @@ def test_a_ratio_that_alone_is_told_is_said() -> None:
     assert weakest_direction(SET, np.diag([4.0, 1e-4, 1e-4])) is None  # one alone is no combination
 
 
+def test_parameters_that_nothing_tells_are_not_told_together() -> None:
+    """Where the variances are those of two guesses, rounding alone mixes their directions."""
+    covariance = np.diag([1.0, 1.0, 1.0])
+    covariance[0, 1] = covariance[1, 0] = 1e-12
+    assert weakest_direction(SET, covariance) is None
+    assert not any("together" in line for line in words(SET, covariance))
+
+
 def test_words_are_silent_where_all_is_seen() -> None:
     assert words(SET, 1e-4 * np.eye(3)) == []
     assert any("C:a" in line for line in words(SET, np.diag([4.0, 1e-4, 1e-4])))
