@@ -164,7 +164,8 @@ def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nomi
             return -np.inf
         whitened, log_det = whiten(problem, latent, nominal, nominal.residual_K[:, :, None])
         count = int(nominal.segment.valid.sum())
-        total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
+        with np.errstate(over="ignore", invalid="ignore"):  # a linearisation that ran away is as unlikely as can be
+            total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
     return total if np.isfinite(total) else -np.inf
 
 

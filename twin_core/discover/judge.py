@@ -23,14 +23,15 @@ other by as much as an event that it has not seen costs."""
 LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
-UNEXPLAINED_SHARE = 3.0
+UNEXPLAINED_SHARE = 1.0
 """Misfit over noise beyond which a record without a supported effect is called unexplained."""
 
 UNTOLD_STD = 1.0
 """Relative deviation beyond which a quantity is not told: a mass of any size is a boundary, not a mass."""
 
-EXPLAINED_SHARE = 0.5
-"""An effect must make half of the latent heat's variance superfluous where it acts, or something else is missing there."""
+EXPLAINED_SHARE, EXPLAINED_SHARE_TOGETHER = 0.6, 0.85
+"""An effect must make this much of the latent heat's variance superfluous where it acts, several at once almost all of it,
+or something else is missing there."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,8 @@ def is_valid(validation: Validation, n_effects: int = 1) -> bool:
     blocks, forward = validation.ratio, validation.forward_ratio
     both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
     either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
-    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > EXPLAINED_SHARE
+    share = EXPLAINED_SHARE if n_effects == 1 else EXPLAINED_SHARE_TOGETHER
+    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > share
     return (both or (either and n_effects == 1)) and matters
 
 

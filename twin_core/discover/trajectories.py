@@ -16,11 +16,14 @@ from twin_core.discover.confirm import (
     weigh,
     weigh_trajectories,
 )
-from twin_core.discover.judge import N_VALIDATED, UNEXPLAINED_SHARE, Judged, Search, accept, once_each, worth
+from twin_core.discover.judge import N_VALIDATED, Judged, Search, accept, once_each, worth
 from twin_core.discover.shortlist import best_of_each_place, refined, screened, shortlist
 
 SHARES = (1.0, 0.1, 0.01)
 N_REFITS = 6
+TOGETHER_MISFIT_SHARE = 3.0
+"""Misfit over noise above which effects are tried together."""
+
 MOST_TOGETHER = 2
 """Effects that are tried together where none helps alone: more fit anything on a long trajectory."""
 
@@ -47,7 +50,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
     if misfit < LEAST_MISFIT_SHARE:
         return False
     sets: list[Judged] = []
-    for n_together in range(1, 2 if fallback or misfit < UNEXPLAINED_SHARE else MOST_TOGETHER + 1):
+    for n_together in range(1, 2 if fallback or misfit < TOGETHER_MISFIT_SHARE else MOST_TOGETHER + 1):
         seeds = [j.trial for j in sets] if sets else [state.trial]
         judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
         sets = once_each(judged)[:N_KEPT]
