@@ -58,7 +58,7 @@ class Browser:
     def _find_page(self) -> str:
         note = self._folder / "DevToolsActivePort"
         for _ in range(200):
-            with contextlib.suppress(OSError, ValueError, httpx.TransportError, StopIteration):
+            with contextlib.suppress(OSError, ValueError, LookupError, httpx.TransportError, StopIteration):
                 port = int(note.read_text().splitlines()[0])
                 pages = httpx.get(f"http://127.0.0.1:{port}/json", trust_env=False).json()
                 page = next(item for item in pages if item["type"] == "page")
