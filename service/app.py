@@ -12,6 +12,7 @@ from service.access import Gate
 from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
 from service.deps import Service
+from service.heads import Heads
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
@@ -121,4 +122,5 @@ def create_app(
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Gate, keys=settings.roles)
     app.add_middleware(Observe, metrics=metrics)
+    app.add_middleware(Heads)
     return app

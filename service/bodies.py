@@ -8,6 +8,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.problems import BadField, Problem, problem
 
 LEAST_RATE_BYTES_PER_S = 32 * 1024
+DECODE_APART_BYTES = 64 * 1024
+"""Larger bodies are unpacked in a thread, so that other requests are answered meanwhile."""
+PIECE_BYTES = 16 * 1024
 DRAIN_FACTOR = 5
 DRAIN_S = 10.0
 
@@ -27,7 +30,9 @@ class Bodies:
             return
         try:
             body = await self._read(headers, receive)
-            body = _decode(body, headers.get(b"content-encoding", b"identity"), self._max_bytes)
+            encoding = headers.get(b"content-encoding", b"identity").lower()
+            if encoding not in (b"", b"identity"):
+                body = await _decode(body, encoding, self._max_bytes)
         except Problem as error:
             await problem(error.status, error.detail, error.errors, headers={"Connection": "close"})(
                 scope, receive, send
@@ -102,19 +107,33 @@ def _replay(body: bytes, receive: Receive) -> Receive:
     return replayed
 
 
-def _decode(body: bytes, encoding: bytes, max_bytes: int) -> bytes:
+async def _decode(body: bytes, encoding: bytes, max_bytes: int) -> bytes:
     """Return the body without its content encoding, never growing beyond ``max_bytes``."""
-    if encoding.lower() in (b"", b"identity"):
-        return body
-    if encoding.lower() not in (b"gzip", b"x-gzip"):
+    if encoding not in (b"gzip", b"x-gzip"):
         raise Problem(415, "content-encoding must be gzip or absent")
-    decoder = zlib.decompressobj(wbits=31)
-    try:
-        plain = decoder.decompress(body, max_bytes + 1)
-    except zlib.error:
-        raise BadField("body", "is not valid gzip", 400) from None
-    if len(plain) > max_bytes:
-        raise Problem(413, f"the body is larger than {max_bytes} bytes after decompression; send smaller batches")
-    if not decoder.eof or decoder.unused_data:
-        raise BadField("body", "is not one complete gzip stream", 400)
-    return plain
+    if len(body) > DECODE_APART_BYTES:
+        return await asyncio.to_thread(_gunzip, body, max_bytes)
+    return _gunzip(body, max_bytes)
+
+
+def _gunzip(body: bytes, max_bytes: int) -> bytes:
+    """Return what all members hold; several may follow one another (RFC 1952)."""
+    parts: list[bytes] = []
+    size, rest = 0, memoryview(body)
+    while rest or not parts:
+        decoder = zlib.decompressobj(wbits=31)
+        while not decoder.eof:
+            piece = rest[:PIECE_BYTES]  # what lies behind the end of a member is copied: let that be little
+            if not piece:
+                raise BadField("body", "is not one complete gzip stream", 400)
+            try:
+                parts.append(decoder.decompress(piece, max_bytes + 1 - size))
+            except zlib.error:
+                raise BadField("body", "is not valid gzip", 400) from None
+            size += len(parts[-1])
+            if size > max_bytes:
+                raise Problem(
+                    413, f"the body is larger than {max_bytes} bytes after decompression; send smaller batches"
+                )
+            rest = rest[len(piece) - len(decoder.unused_data) :]
+    return b"".join(parts)

@@ -1,10 +1,10 @@
 """Telemetry bodies -> one batch of arrays: JSON columns or NDJSON frames, refused whole if anything is malformed."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import orjson
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from service.instants import Instants, parse_instants
 from service.problems import BadField, Problem
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,14 @@ class Batch:
     values: NDArray[np.float64]
 
 
-def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
-    """Return the batch of ``{"time": [...], "values": {channel: [...]}}``.
+Units = Mapping[str, str | None]
+"""Channel -> unit, in the order of the rows."""
+TOLD_BY_THE_ARCHIVE = frozenset({"time", "values", "units", "samples", "downsampled"})
+"""What the archive answers can be sent to ingest: units are compared, the others say nothing about the samples."""
+
+
+def parse_columns(body: bytes, channels: Units) -> Batch:
+    """Return the batch of ``{"time": [...], "values": {channel: [...]}}``; ``units`` may stand beside them.
 
     Raises
     ------
@@ -39,9 +47,10 @@ def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
         400 if the body is not JSON, 422 naming the field otherwise.
     """
     document = _load(body, "body")
-    times, columns = _members(document, "")
+    times, columns = _members(document, "", TOLD_BY_THE_ARCHIVE)
     if not isinstance(times, list):
         raise BadField("time", "must be a list")
+    _check_units(document.get("units", {}), channels)
     positions = {name: row for row, name in enumerate(channels)}
     rows = [_position(positions, name, f"values.{name}") for name in columns]
     for name, column in columns.items():
@@ -55,6 +64,22 @@ def parse_columns(body: bytes, channels: Sequence[str]) -> Batch:
     return Batch(parse_instants(times), values)
 
 
+def _check_units(units: Any, channels: Units) -> None:
+    """Refuse values in another unit than the channel's."""
+    if not isinstance(units, dict):
+        raise BadField("units", "must be an object with one member per channel")
+    for name, unit in units.items():
+        declared = _position(channels, name, f"units.{name}")
+        if unit != declared:
+            raise BadField(
+                f"units.{name}", f"is {_show(unit)}, the channel is in {_show(declared)}; convert the values"
+            )
+
+
+def _show(value: Any) -> str:
+    return json.dumps(value)[:60]
+
+
 def _matrix(columns: dict[str, list[Any]]) -> NDArray[np.float64]:
     """Return equally long columns as one array, (n_columns, n_times); the slow way only where something is wrong."""
     if all(_NUMBERS.issuperset(map(type, column)) for column in columns.values()):
@@ -64,7 +89,7 @@ def _matrix(columns: dict[str, list[Any]]) -> NDArray[np.float64]:
     return np.stack([_numbers(column, partial(_element, name)) for name, column in columns.items()])
 
 
-def parse_frames(body: bytes, channels: Sequence[str]) -> Batch:
+def parse_frames(body: bytes, channels: Units) -> Batch:
     """Return the batch of NDJSON frames ``{"time": ..., "values": {channel: ...}}``, one per line.
 
     Raises
@@ -78,7 +103,7 @@ def parse_frames(body: bytes, channels: Sequence[str]) -> Batch:
     for (number, _), (_, sample) in zip(lines, frames, strict=True):
         if not known.issuperset(sample):
             stranger = next(name for name in sample if name not in known)
-            _position(dict.fromkeys(channels, 0), stranger, f"line {number}: values.{stranger}")
+            _position(channels, stranger, f"line {number}: values.{stranger}")
     values = np.full((len(channels), len(frames)), np.nan)
     for row, name in enumerate(channels):
         column = [sample.get(name) for _, sample in frames]
@@ -123,25 +148,27 @@ def _search(item: Any, where: str) -> str | None:
     return next((found for child, place in children if (found := _search(child, place))), None)
 
 
-def _members(document: Any, prefix: str) -> tuple[Any, dict[str, Any]]:
+def _members(
+    document: Any, prefix: str, known: frozenset[str] = frozenset({"time", "values"})
+) -> tuple[Any, dict[str, Any]]:
     """Return the two members that a body or frame must have, and refuse any other."""
     if not isinstance(document, dict):
         raise BadField(f"{prefix}body", 'must be an object {"time": ..., "values": {...}}')
     for name in ("time", "values"):
         if name not in document:
             raise BadField(f"{prefix}{name}", "is missing")
-    if len(document) != 2:
-        stranger = next(name for name in document if name not in ("time", "values"))
+    if not known.issuperset(document):
+        stranger = next(name for name in document if name not in known)
         raise BadField(f"{prefix}{stranger}", "unknown field; only time and values are expected")
     if not isinstance(document["values"], dict):
         raise BadField(f"{prefix}values", "must be an object with one member per channel")
     return document["time"], document["values"]
 
 
-def _position(positions: dict[str, int], name: str, field: str) -> int:
-    if name not in positions:
-        raise BadField(field, f"unknown channel '{name}' (known: {', '.join(positions)})")
-    return positions[name]
+def _position(known: Mapping[str, T], name: str, field: str) -> T:
+    if name not in known:
+        raise BadField(field, f"unknown channel '{name}' (known: {', '.join(known)})")
+    return known[name]
 
 
 def _element(name: str, index: int) -> str:
@@ -159,7 +186,7 @@ def _numbers(column: list[Any], field: Callable[[int], str]) -> NDArray[np.float
     """Return finite numbers with NaN for null, (n_times,); text and booleans are not numbers."""
     if not _NUMBERS.issuperset(map(type, column)):
         index = next(i for i, value in enumerate(column) if type(value) not in _NUMBERS)
-        raise BadField(field(index), f"must be a finite number or null, got {json.dumps(column[index])[:60]}")
+        raise BadField(field(index), f"must be a finite number or null, got {_show(column[index])}")
     numbers = np.array(column, dtype=np.float64)
     if np.isinf(numbers).any():
         raise BadField(field(int(np.argmax(np.isinf(numbers)))), "is not a finite number")

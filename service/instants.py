@@ -91,9 +91,21 @@ def _parse_one(value: Any) -> int:
     if match is None:
         raise ValueError
     date, clock, fraction, offset = match.groups()
+    is_leap = clock.endswith(":60")
+    clock = clock[:-2] + "59" if is_leap else clock
     whole = datetime.fromisoformat(f"{date}T{clock}{'+00:00' if offset in 'Zz' else offset}")
+    if is_leap:
+        whole = _after_leap_second(whole)
     micros = round(int(fraction) * 10 ** (6 - len(fraction))) if fraction else 0
     return (whole - _EPOCH) // timedelta(microseconds=1) + micros
+
+
+def _after_leap_second(before: datetime) -> datetime:
+    """Return the second after a leap second, which stands for it: unix time has none, and only months end with one."""
+    after = (before + timedelta(seconds=1)).astimezone(UTC)
+    if (after.day, after.hour, after.minute) != (1, 0, 0):
+        raise ValueError
+    return after
 
 
 _LENGTHS = {20: 0, 24: 3, 27: 6}

@@ -60,8 +60,8 @@ class Entry:
 
     @cached_property
     def units(self) -> dict[str, str | None]:
-        """Channel -> unit."""
-        return {name: channel.get("unit") for name, channel in self.specification["channels"].items()}
+        """Channel -> unit, in the order of the channels."""
+        return {name: self.specification["channels"][name].get("unit") for name in self.channels}
 
 
 class Registry:

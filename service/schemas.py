@@ -88,6 +88,14 @@ class Columns(BaseModel):
     values: dict[str, list[Number | None]]
 
 
+class Posted(Columns):
+    """Samples on their way in; what the archive tells besides may stay: units must be the channels' own."""
+
+    units: dict[str, str | None] = {}
+    samples: int | None = None
+    downsampled: bool | None = None
+
+
 class Archive(_Answer):
     """A part of the archive; ``downsampled`` tells that extremes were kept and other samples left out."""
 

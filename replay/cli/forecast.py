@@ -56,7 +56,7 @@ def forecast(
     result = look_ahead(model, record, horizon, step_s=step, plan=planned)
     document = _document(result, record, model)
     _write(out, document)
-    notify([*record.notices, *result.notices])
+    notify([*record.notices, *(planned.notices if planned else ()), *result.notices])
     if as_json:
         print_line(to_json(document).rstrip())
     else:
@@ -78,8 +78,11 @@ def _load_plan(path: Path, record: "Record", model: "CalibratedModel", horizon_s
         raise TelemetryError(f"{path}: plans no input; give columns of power, auxiliary or boundary channels")
     if (plan.epoch_ns is None) != (record.epoch_ns is None):
         raise TelemetryError(f"{path}: must write time in the form of {record.name} (dates or seconds)")
+    readings = [name for name in plan.values if name in model.spec.sensors]
+    notices = (f"{path}: ignored {', '.join(readings)}, which the forecast predicts",) if readings else ()
     shift_s = 0.0 if plan.epoch_ns is None or record.epoch_ns is None else (plan.epoch_ns - record.epoch_ns) / 1e9
-    shifted = replace(plan, time_s=plan.time_s + shift_s, epoch_ns=record.epoch_ns)
+    planned = {name: plan.values[name] for name in inputs}
+    shifted = replace(plan, time_s=plan.time_s + shift_s, values=planned, epoch_ns=record.epoch_ns, notices=notices)
     _check_plan(shifted, inputs, float(record.time_s[-1]), horizon_s)
     return shifted
 

@@ -14,7 +14,7 @@ from service.live import forecasts
 from service.registry import Entry
 from service.routes.telemetry import MOST_POINTS, span
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Network, Residuals
-from service.store import anomalies, residuals
+from service.store import anomalies, models, residuals
 from service.store.residuals import Residuals as Found
 
 router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
@@ -67,6 +67,8 @@ async def list_residuals(
 ) -> Response:
     """Return innovations, their predicted standard deviations and the NIS."""
     start_us, stop_us = span(start, stop)
+    if version is not None:
+        await service.database.read(models.get, twin.key, version)
     tracker = service.live.tracker(twin)
     await tracker.settled(forecasts.SETTLE_S)
     chosen = version or (tracker.active.version if tracker.active is not None else 0)

@@ -17,7 +17,7 @@ from service.instants import Instants, format_instant, format_instants, parse_pa
 from service.messages import SampleStretch
 from service.problems import BadField, Problem
 from service.registry import Entry
-from service.schemas import Archive, Columns, IngestReport
+from service.schemas import Archive, IngestReport, Posted
 from service.store import samples
 from service.store.samples import Receipt, Samples
 
@@ -32,7 +32,7 @@ _FRAME = {"type": "string", "description": 'One {"time": ..., "values": {...}} p
 _BODY = {
     "requestBody": {
         "required": True,
-        "content": {"application/json": {"schema": Columns.model_json_schema()}, NDJSON: {"schema": _FRAME}},
+        "content": {"application/json": {"schema": Posted.model_json_schema()}, NDJSON: {"schema": _FRAME}},
     }
 }
 
@@ -46,9 +46,9 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     body = await request.body()
     parse = _parser(request.headers.get("content-type", ""))
     if len(body) > PARSE_APART_BYTES:
-        batch = await asyncio.to_thread(parse, body, entry.channels)
+        batch = await asyncio.to_thread(parse, body, entry.units)
     else:
-        batch = parse(body, entry.channels)
+        batch = parse(body, entry.units)
     entry.refuse_implausible(batch.values)
     receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
     if accepted.size:

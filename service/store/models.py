@@ -8,7 +8,7 @@ from typing import Any
 import orjson
 
 from service.instants import format_instant, now_us, parse_instant
-from service.problems import Problem
+from service.problems import BadField
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def get(connection: sqlite3.Connection, twin: int, version: int) -> ModelRow:
     """Return one version; Problem 404 if there is none of that number."""
     row = connection.execute(_SELECT + "AND version = ?", (twin, version)).fetchone()
     if row is None:
-        raise Problem(404, f"no model version {version}")
+        raise BadField("version", f"there is no model version {version}", 404)
     return _row(row)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 
 from tests.service.conftest import SPEC
@@ -145,3 +146,27 @@ def test_a_caller_that_hangs_up_in_the_middle(server: Server) -> None:
     client = server.client()
     assert client.archive("benchsat").samples == 0
     assert "unexpected error" not in server.log()
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/healthz", "/readyz", "/metrics", "/docs", "/assets/style.css", "/v1/twins", ROUTE, "/nowhere"]
+)
+def test_head_is_get_without_its_body(server: Server, path: str) -> None:
+    with httpx.Client(base_url=server.url) as client:
+        asked, told = client.head(path), client.get(path)
+    assert (asked.status_code, asked.content) == (told.status_code, b"")
+    differing = {"date", "content-length"} if path == "/metrics" else {"date"}
+    assert {n: v for n, v in asked.headers.items() if n not in differing} == {
+        n: v for n, v in told.headers.items() if n not in differing
+    }
+
+
+def test_head_of_a_stream_ends(server: Server) -> None:
+    answer = httpx.head(f"{server.url}/v1/twins/benchsat/events", timeout=5)
+    assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
+    client = httpx.get(f"{server.url}/metrics")
+    assert "twin_stream_readers 0.0" in client.text
+
+
+def test_head_is_no_way_to_post(server: Server) -> None:
+    assert httpx.head(f"{server.url}/v1/twins/benchsat/models/1/activate").status_code == 405

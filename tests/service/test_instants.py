@@ -52,6 +52,18 @@ def test_microseconds_only_where_there_are_any() -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "instant"),
+    [
+        ("2016-12-31T23:59:60Z", "2017-01-01T00:00:00Z"),
+        ("2016-12-31T23:59:60.250Z", "2017-01-01T00:00:00.250000Z"),
+        ("2015-06-30T18:59:60.5-05:00", "2015-07-01T00:00:00.500000Z"),
+    ],
+)
+def test_a_leap_second_counts_as_the_second_after_it(text: str, instant: str) -> None:
+    assert format_instants(parse_instants([text] * 50)) == [instant] * 50
+
+
+@pytest.mark.parametrize(
     "text", ["1767225600", "2026-01-01T00:00:00Z", "2026-01-01T01:00:00+01:00", "2026-01-01T01:00:00 01:00"]
 )
 def test_parameters_take_both_forms_and_a_plus_that_became_a_blank(text: str) -> None:
@@ -71,6 +83,10 @@ WRONG += [
     "2026-01-01T25:00:00Z",
     "2026-01-01T00:60:00Z",
     "2026-01-01T00:00:60Z",
+    "2016-12-31T23:59:61Z",
+    "2016-12-30T23:59:60Z",
+    "2016-12-31T22:59:60Z",
+    "2016-12-31T23:59:60+01:00",
     "2026-01-01T00:00:00",
     "２026-01-01T00:00:00Z",
 ]

@@ -82,6 +82,26 @@ def test_frames_line_by_line_and_gzipped(registered: AppClient) -> None:
     assert registered.post(ROUTE, content=gzip.compress(body), headers=headers).json()["duplicates"] == 2
 
 
+def test_a_gzip_body_may_have_several_members(registered: AppClient) -> None:
+    lines = [b'{"time": %d, "values": {"T_px": 1}}\n' % number for number in range(300)]
+    body = b"".join(map(gzip.compress, lines))  # as `cat a.gz b.gz` writes it
+    headers = {"content-type": "application/x-ndjson", "content-encoding": "gzip"}
+    assert registered.post(ROUTE, content=body, headers=headers).json()["accepted"] == 300
+
+
+def test_what_the_archive_answers_can_be_sent_again(registered: AppClient) -> None:
+    send(registered, ["2026-01-01T00:00:00Z", 1767225610.25], T_px=[290.5, None], T_tank=[-3, 4.125])
+    for parameters in ({}, {"channels": "T_tank"}, {"max_points": 2}):
+        answer = registered.get(ROUTE, params=parameters)
+        again = registered.post(ROUTE, content=answer.content, headers={"content-type": "application/json"})
+        assert again.json() == {
+            "accepted": 0,
+            "duplicates": 2,
+            "rejected": [],
+            "last_time": "2026-01-01T00:00:10.250000Z",
+        }
+
+
 def test_a_sample_without_a_value_is_a_sample_in_either_form(registered: AppClient) -> None:
     headers = {"content-type": "application/x-ndjson"}
     lines = b'{"time": 50, "values": {}}\n{"time": 60, "values": {"T_px": null}}\n{"time": 70, "values": {"T_px": 1}}'

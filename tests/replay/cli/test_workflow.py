@@ -69,6 +69,20 @@ def test_forecast_follows_its_plan(desk: Path, capsys: pytest.CaptureFixture[str
     assert 8.0 < ends[200] - ends[0] < 10.9
 
 
+def test_a_plan_with_readings_is_told_that_they_change_nothing(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model, data, plan = desk / "model.json", desk / "data.csv", desk / "plan.csv"
+    run(capsys, "calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
+    written = []
+    for text in ("time,Q_a\n2026-01-01T09:59:00Z,50\n", "time,T_a,Q_a\n2026-01-01T09:59:00Z,400,50\n"):
+        plan.write_text(text)
+        command = ("forecast", "--model", model, "--telemetry", data, "--horizon", "600", "--plan", plan)
+        assert main([*map(str, command), "--out", str(desk / "ahead.csv")]) == 0
+        told = capsys.readouterr().err
+        assert ("ignored T_a, which the forecast predicts" in " ".join(told.split())) == ("T_a" in text)
+        written.append((desk / "ahead.csv").read_text())
+    assert written[0] == written[1]
+
+
 def test_a_forecast_says_where_a_learned_heat_is_not_at_home(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A model file whose heat was learned some kelvin away: the note goes to stderr and into the document."""
     model, data, out = desk / "model.json", desk / "data.csv", desk / "beyond.json"
