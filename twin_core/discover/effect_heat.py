@@ -3,9 +3,8 @@
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Search
-from twin_core.effects.base import Effect
+from twin_core.effects.base import touched_nodes
 from twin_core.network.dynamics import fill_boundaries
 
 MAX_NODES = 4
@@ -17,23 +16,11 @@ def nodes_of_interest(search: Search) -> list[str]:
     nodes: list[str] = []
     for finding in search.findings:
         for effect in finding.effects:
-            nodes += _touched(effect, search.base)
+            nodes += touched_nodes(effect, search.base.fit.network.layout)
     if not nodes:
         declared = search.base.fit.problem.network.nodes
         nodes = [declared[i] for i in np.argsort(-search.base.fit.latent.std_W)[:2]]
     return list(dict.fromkeys(nodes))[:MAX_NODES]
-
-
-def _touched(effect: Effect, base: Trial) -> list[str]:
-    """Return the declared nodes at which an effect acts."""
-    layout = base.fit.problem.network.layout
-    if "node" in effect.where:
-        return [effect.where["node"]]
-    if "nodes" in effect.where:
-        return [n for n in effect.where["nodes"] if n in layout.declared_nodes]
-    if "channel" in effect.where:
-        return [load.node for load in layout.loads_of(effect.where["channel"])]
-    return [layout.sensor_node(effect.where["sensor"])]
 
 
 def effect_heat(search: Search, states_K: FloatArray, first_step: int) -> FloatArray | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
+from twin_core.discover.form import leaves_a_repeatable_heat
 from twin_core.effects.base import Effect
 
 N_VALIDATED = 3
@@ -88,7 +89,12 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         if best.evidence.log_bayes_factor <= needed:
             continue
         own = replace(best, validation=validate(state.trial, best.trial))
-        if own.validation is not None and is_valid(own.validation, len(own.effects)) and is_told(own):
+        if (
+            own.validation is not None
+            and is_valid(own.validation, len(own.effects))
+            and is_told(own)
+            and _is_named_well(own, needed)
+        ):
             close = [j for j in judged if j is not best and j not in failed and is_close(j, best)]
             state.trial = best.trial
             state.findings.append(Finding(own, tuple(close)))
@@ -97,6 +103,12 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         state.rejected.append(own)
     state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
     return False
+
+
+def _is_named_well(judged: Judged, needed: float) -> bool:
+    """Return whether the effects are a law that holds, or make no claim to be one."""
+    named = [effect for effect in judged.effects if not effect.fallback]
+    return not named or not leaves_a_repeatable_heat(judged.trial, named, needed)
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

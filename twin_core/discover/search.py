@@ -10,15 +10,12 @@ from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, try_effects, weigh
 from twin_core.discover.judge import Finding, Judged, Search, accept, threshold, worth
 from twin_core.discover.screen import Probe, Screening, joint_gain
-from twin_core.discover.shortlist import best_of_each_place, refined, screened, shortlist
+from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
 from twin_core.effects.base import Effect
 
 MAX_FINDINGS = 4
 N_REFITS = 12
-LATENT_SHARES = (1.0, 0.1, 0.01)
-"""Sizes of the latent heat at which candidates are screened, as shares of the fitted one."""
-
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
 N_SETTLED = 4

@@ -10,6 +10,9 @@ from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, su
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Survey
 
+LATENT_SHARES = (1.0, 0.1, 0.01)
+"""Sizes of the latent heat at which candidates are screened, as shares of the fitted one."""
+
 N_VARIED = 4
 """Places at the head of the shortlist that are tried from more than one start."""
 

@@ -17,9 +17,8 @@ from twin_core.discover.confirm import (
     weigh_trajectories,
 )
 from twin_core.discover.judge import N_VALIDATED, Judged, Search, accept, once_each, worth
-from twin_core.discover.shortlist import best_of_each_place, refined, screened, shortlist
+from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 
-SHARES = (1.0, 0.1, 0.01)
 N_REFITS = 6
 TOGETHER_MISFIT_SHARE = 3.0
 """Misfit over noise above which effects are tried together."""
@@ -66,7 +65,7 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     """Return what one more effect makes of a trial, judged against the state's model."""
     calibration = seed.calibration
     fit = about_trajectory(calibration.problem, calibration.optimum)
-    screenings = screened(seed, fit, SHARES, fallback=fallback)
+    screenings = screened(seed, fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
     judged = []

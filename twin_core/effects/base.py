@@ -350,6 +350,17 @@ def require(where: Where, kind: type[Effect]) -> None:
             )
 
 
+def touched_nodes(effect: Effect, layout: Layout) -> list[str]:
+    """Return the declared nodes at which an effect acts: those that a channel feeds, the one that a sensor reads."""
+    if "node" in effect.where:
+        return [effect.where["node"]]
+    if "nodes" in effect.where:
+        return [n for n in effect.where["nodes"] if n in layout.declared_nodes]
+    if "channel" in effect.where:
+        return [load.node for load in layout.loads_of(effect.where["channel"])]
+    return [layout.sensor_node(effect.where["sensor"])]
+
+
 def to_json(effect: Effect) -> Json:
     """Return an effect as plain data."""
     where = {k: v if isinstance(v, str) else list(v) for k, v in effect.where.items()}

@@ -1,0 +1,70 @@
+"""A name stands for a law: what merely resembles the missing heat leaves the difference behind. Readings are SciPy's."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twin_core.calibrate.second_order import fit_network
+from twin_core.discover.confirm import Trial, try_effects, weigh
+from twin_core.discover.form import leaves_a_repeatable_heat
+from twin_core.discover.judge import threshold
+from twin_core.discover.screen import screen, survey_of
+from twin_core.effects.proportional_heater import ProportionalHeater
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+CAPACITY, LEAK, NOISE_K, WALL_K = 900.0, 1.5, 0.03, 270.0
+TIMES = 60.0 * np.arange(300)
+POWER = np.repeat(np.random.default_rng(0).uniform(0.0, 40.0, 15), 20)
+SPEC = TwinSpec.model_validate(
+    {
+        "twin": "t",
+        "boundaries": {"wall": {"value_K": WALL_K}},
+        "channels": {
+            "T_a": {"kind": "temperature", "unit": "K", "noise_std": NOISE_K},
+            "Q": {"kind": "power", "unit": "W"},
+        },
+        "nodes": [{"id": "a", "sensor": "T_a", "capacity_J_per_K": {"value": CAPACITY}}],
+        "conductors": [{"between": ["a", "wall"], "conductance_W_per_K": {"value": LEAK}}],
+        "loads": [{"channel": "Q", "node": "a"}],
+    }
+)
+NEEDED = threshold(0.01)
+
+
+def heater(temperature_K: float) -> float:
+    """Return the heat of a proportional heater."""
+    return float(np.clip(1.2 * (288.0 - temperature_K), 0.0, 9.0))
+
+
+def resonance(temperature_K: float) -> float:
+    """Return a heat that is largest at one temperature: on its warm side it falls to nothing as a heater's does."""
+    return 12.0 * float(np.exp(-0.5 * ((temperature_K - 281.0) / 4.0) ** 2))
+
+
+def named(heat_W: Callable[[float], float]) -> tuple[Trial, Trial]:
+    """Return the declared model, and that with a proportional heater, fitted to readings of a world with hidden heat."""
+    readings = [np.array([282.0])]
+    for k, power in enumerate(POWER[:-1]):
+
+        def rate(_: float, x: np.ndarray, power: float = power) -> list[float]:
+            return [(power + LEAK * (WALL_K - x[0]) + heat_W(x[0])) / CAPACITY]
+
+        readings.append(solve_ivp(rate, TIMES[k : k + 2], readings[-1], rtol=1e-9, atol=1e-9).y[:, -1])
+    noise = NOISE_K * np.random.default_rng(1).normal(size=TIMES.size)
+    record = Record(TIMES, {"T_a": np.array(readings)[:, 0] + noise, "Q": POWER})
+    fit, calibration = fit_network(SPEC, [record])
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    survey = survey_of(fit)
+    probes = screen(fit, survey, ProportionalHeater.starts({"node": "a"}, survey)).probes[:3]
+    trials = [try_effects(base, [probe.effect], n_passes=15) for probe in probes]
+    return base, max(trials, key=lambda trial: trial.fit.log_posterior)
+
+
+@pytest.mark.parametrize(("heat_W", "left"), [(heater, False), (resonance, True)])
+def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[[float], float], left: bool) -> None:
+    base, trial = named(heat_W)
+    assert weigh(base, trial, 1).log_bayes_factor > NEEDED  # either way the heater looks well supported
+    assert leaves_a_repeatable_heat(trial, trial.effects, NEEDED) is left
