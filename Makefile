@@ -40,6 +40,7 @@ bench-paper-a: $(BENCH)
 
 bench-loop: $(BENCH)
 	$(BIN)/python -m benchmarks.loop
+	$(BIN)/python -m benchmarks.band_study
 	$(BIN)/python -m benchmarks.loop_rivals
 
 bench-service: $(STAMP)

@@ -40,27 +40,28 @@ def radiation_to_sink(world: World, node: int) -> Hidden:
     """Return radiation to space."""
     area = float(world.rng.uniform(0.05, 0.15))
     heat = _into(world, node, lambda t, k, x: SIGMA * area * (SPACE_K**4 - x**4))
-    return Hidden({"node": f"n{node}", "sink": "space"}, heat)
+    return Hidden({"node": f"n{node}", "sink": "space"}, heat, parameters={"R_m2": area})
 
 
 def leak_to_boundary(world: World, node: int) -> Hidden:
     """Return a leak to the room."""
     g = float(world.rng.uniform(0.3, 1.5))
     heat = _into(world, node, lambda t, k, x: g * (world.room_K[k] - x))
-    return Hidden({"node": f"n{node}", "boundary": "room"}, heat)
+    return Hidden({"node": f"n{node}", "boundary": "room"}, heat, parameters={"G_W_per_K": g})
 
 
 def constant_heat_load(world: World, node: int) -> Hidden:
     """Return a constant heat of either sign."""
-    q0 = world.mean_load_W * float(world.rng.uniform(0.2, 0.5)) * world.rng.choice([-1.0, 1.0])
-    return Hidden({"node": f"n{node}"}, _into(world, node, lambda t, k, x: q0))
+    q0 = float(world.mean_load_W * world.rng.uniform(0.2, 0.5) * world.rng.choice([-1.0, 1.0]))
+    return Hidden({"node": f"n{node}"}, _into(world, node, lambda t, k, x: q0), parameters={"Q_W": q0})
 
 
 def channel_heat_load(world: World, node: int) -> Hidden:
     """Return a heat per mode."""
     table = world.mean_load_W * world.rng.uniform(0.2, 0.8, 3) * np.array([0.0, 1.0, -0.6])
     heat = _into(world, node, lambda t, k, x: table[int(world.mode[k])])
-    return Hidden({"node": f"n{node}", "channel": "mode"}, heat)
+    levels = {"knots": [0.0, 1.0, 2.0], "values_W": table.tolist()}
+    return Hidden({"node": f"n{node}", "channel": "mode"}, heat, parameters=levels)
 
 
 def proportional_heater(world: World, node: int) -> Hidden:
@@ -68,7 +69,8 @@ def proportional_heater(world: World, node: int) -> Hidden:
     gain, limit = float(world.rng.uniform(2.0, 6.0)), world.mean_load_W * float(world.rng.uniform(0.4, 0.9))
     set_point = float(np.quantile(world.simulate()[:, node], 0.6))
     heat = _into(world, node, lambda t, k, x: min(limit, gain * max(set_point - x, 0.0)))
-    return Hidden({"node": f"n{node}"}, heat)
+    sizes = {"k_W_per_K": gain, "T_set_K": set_point, "Q_W": limit}
+    return Hidden({"node": f"n{node}"}, heat, parameters=sizes)
 
 
 def input_gain(world: World, node: int) -> Hidden:
@@ -76,14 +78,15 @@ def input_gain(world: World, node: int) -> Hidden:
     channel = int(world.rng.choice(list(world.power)))
     g = float(world.rng.choice([world.rng.uniform(0.5, 0.8), world.rng.uniform(1.2, 1.5)]))
     heat = _into(world, channel, lambda t, k, x: (g - 1.0) * world.power[channel][k])
-    return Hidden({"channel": f"P{channel}"}, heat)
+    return Hidden({"channel": f"P{channel}"}, heat, parameters={"g": g})
 
 
 def missing_conductor(world: World, node: int) -> Hidden:
     """Return a strap."""
     a, b = _free_pair(world)
     g = float(world.rng.uniform(0.5, 2.0))
-    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, _between(world, a, b, lambda t, k, x: g * (x[b] - x[a])))
+    heat = _between(world, a, b, lambda t, k, x: g * (x[b] - x[a]))
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat, parameters={"G_W_per_K": g})
 
 
 def hidden_mass(world: World, node: int) -> Hidden:
@@ -101,6 +104,7 @@ def hidden_mass(world: World, node: int) -> Hidden:
         heat,
         rates=lambda x: np.array([g * (x[node] - x[world.n]) / mass]),
         n_extra=1,
+        parameters={"C_J_per_K": mass, "G_W_per_K": g},
     )
 
 
@@ -109,7 +113,7 @@ def radiative_exchange(world: World, node: int) -> Hidden:
     a, b = _free_pair(world)
     area = float(world.rng.uniform(0.08, 0.35))
     heat = _between(world, a, b, lambda t, k, x: SIGMA * area * (x[b] ** 4 - x[a] ** 4))
-    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat)
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat, parameters={"R_m2": area})
 
 
 def nonlinear_convection(world: World, node: int) -> Hidden:
@@ -120,16 +124,17 @@ def nonlinear_convection(world: World, node: int) -> Hidden:
         d = world.room_K[k] - x
         return k0 * float(np.sign(d) * abs(d) ** p)
 
-    return Hidden({"node": f"n{node}", "boundary": "room"}, _into(world, node, q))
+    return Hidden({"node": f"n{node}", "boundary": "room"}, _into(world, node, q), parameters={"k": k0, "p": p})
 
 
 def periodic_heat_load(world: World, node: int) -> Hidden:
     """Return a heat with a period of its own, between a fifth of an orbit and three orbits."""
-    size = world.mean_load_W * world.rng.uniform(0.2, 0.6)
+    size = float(world.mean_load_W * world.rng.uniform(0.2, 0.6))
     q0, phase = size * float(world.rng.uniform(-0.5, 0.5)), float(world.rng.uniform(0.0, 2.0 * np.pi))
     period_s = world.period_s * float(np.exp(world.rng.uniform(np.log(0.2), np.log(3.0))))
     heat = _into(world, node, lambda t, k, x: q0 + size * float(np.sin(2.0 * np.pi * t / period_s + phase)))
-    return Hidden({"node": f"n{node}"}, heat)
+    wave = {"A_W": size * float(np.cos(phase)), "B_W": size * float(np.sin(phase))}
+    return Hidden({"node": f"n{node}"}, heat, parameters={"Q_W": q0, **wave, "P_s": period_s})
 
 
 def thermostat_heater(world: World, node: int) -> Hidden:
@@ -148,7 +153,8 @@ def thermostat_heater(world: World, node: int) -> Hidden:
         return float(off_K - x[node] if relay["on"] else x[node] - on_K)
 
     heat = _into(world, node, lambda t, k, x: power * relay["on"])
-    return Hidden({"node": f"n{node}"}, heat, switch=Switch(crossing, flip))
+    sizes = {"Q_W": power, "T_on_K": on_K, "T_off_K": off_K}
+    return Hidden({"node": f"n{node}"}, heat, switch=Switch(crossing, flip), parameters=sizes)
 
 
 def capacity_temperature(world: World, node: int) -> Hidden:
@@ -163,7 +169,8 @@ def capacity_temperature(world: World, node: int) -> Hidden:
         more[node] = world.capacity[node] * max(kappa * (x[node] - centre), -0.8)
         return more
 
-    return Hidden({"node": f"n{node}"}, capacity=capacity)
+    sizes = {"kappa_per_K": kappa, "T_ref_K": float(centre)}
+    return Hidden({"node": f"n{node}"}, capacity=capacity, parameters=sizes)
 
 
 def latent_heat(world: World, node: int) -> Hidden:
@@ -177,7 +184,8 @@ def latent_heat(world: World, node: int) -> Hidden:
         more[node] = area * np.exp(-0.5 * ((x[node] - centre) / width) ** 2) / (width * np.sqrt(2.0 * np.pi))
         return more
 
-    return Hidden({"node": f"n{node}"}, capacity=capacity)
+    sizes = {"L_J": area, "T_m_K": centre, "w_K": width}
+    return Hidden({"node": f"n{node}"}, capacity=capacity, parameters=sizes)
 
 
 def _onset_s(world: World) -> float:
@@ -194,7 +202,7 @@ def input_step(world: World, node: int) -> Hidden:
     """Return a payload heat that changes at an instant."""
     channel, onset, f = int(world.rng.choice(list(world.power))), _onset_s(world), _fraction(world)
     heat = _into(world, channel, lambda t, k, x: (f - 1.0) * world.power[channel][k] if t >= onset else 0.0)
-    return Hidden({"channel": f"P{channel}"}, heat, onset_s=onset)
+    return Hidden({"channel": f"P{channel}"}, heat, onset_s=onset, parameters={"f": f, "time": onset})
 
 
 def input_drift(world: World, node: int) -> Hidden:
@@ -202,7 +210,7 @@ def input_drift(world: World, node: int) -> Hidden:
     channel = int(world.rng.choice(list(world.power)))
     rate = float(world.rng.uniform(0.4, 0.8) * world.rng.choice([-1.0, 1.0]) / world.time_s[-1])
     heat = _into(world, channel, lambda t, k, x: rate * t * world.power[channel][k])
-    return Hidden({"channel": f"P{channel}"}, heat)
+    return Hidden({"channel": f"P{channel}"}, heat, parameters={"r_per_s": rate})
 
 
 def _edge(world: World) -> tuple[int, int, float]:
@@ -215,7 +223,7 @@ def conductance_step(world: World, node: int) -> Hidden:
     """Return a strap that changes at an instant."""
     (a, b, g), onset, f = _edge(world), _onset_s(world), _fraction(world)
     heat = _between(world, a, b, lambda t, k, x: (f - 1.0) * g * (x[b] - x[a]) if t >= onset else 0.0)
-    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat, onset_s=onset)
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, heat, onset_s=onset, parameters={"f": f, "time": onset})
 
 
 def conductance_temperature(world: World, node: int) -> Hidden:
@@ -227,7 +235,8 @@ def conductance_temperature(world: World, node: int) -> Hidden:
     def exchange(t: float, k: int, x: np.ndarray) -> float:
         return g * max(beta * (0.5 * (x[a] + x[b]) - reference), -1.0) * (x[b] - x[a])
 
-    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, _between(world, a, b, exchange))
+    sizes = {"beta_per_K": beta, "T_ref_K": reference}
+    return Hidden({"nodes": [f"n{a}", f"n{b}"]}, _between(world, a, b, exchange), parameters=sizes)
 
 
 def emissivity_step(world: World, node: int) -> Hidden:
@@ -236,26 +245,27 @@ def emissivity_step(world: World, node: int) -> Hidden:
     onset, area = _onset_s(world), world.radiators[at]
     f = float(world.rng.choice([world.rng.uniform(0.6, 0.85), world.rng.uniform(1.15, 1.4)]))
     heat = _into(world, at, lambda t, k, x: (f - 1.0) * area * SIGMA * (SPACE_K**4 - x**4) if t >= onset else 0.0)
-    return Hidden({"node": f"n{at}", "sink": "space"}, heat, onset_s=onset)
+    sizes = {"f": f, "time": onset}
+    return Hidden({"node": f"n{at}", "sink": "space"}, heat, onset_s=onset, parameters=sizes)
 
 
-def _misread(world: World, node: int, offset_K: np.ndarray, onset_s: float | None = None) -> Hidden:
+def _misread(world: World, node: int, offset_K: np.ndarray, sizes: dict[str, float]) -> Hidden:
     """Return a fault of the sensor of one node."""
     columns = np.zeros((world.time_s.size, world.n))
     columns[:, node] = offset_K
-    return Hidden({"sensor": f"T{node}"}, offset_K=columns, onset_s=onset_s)
+    return Hidden({"sensor": f"T{node}"}, offset_K=columns, onset_s=sizes.get("time"), parameters=sizes)
 
 
 def sensor_bias(world: World, node: int) -> Hidden:
     """Return a sensor that reads too much or too little from an instant on."""
     onset, b = _onset_s(world), float(world.rng.uniform(0.5, 3.0) * world.rng.choice([-1.0, 1.0]))
-    return _misread(world, node, np.where(world.time_s >= onset, b, 0.0), onset)
+    return _misread(world, node, np.where(world.time_s >= onset, b, 0.0), {"b_K": b, "time": onset})
 
 
 def sensor_drift(world: World, node: int) -> Hidden:
     """Return a sensor that drifts by some kelvins over the record."""
     rate = float(world.rng.uniform(1.0, 4.0) * world.rng.choice([-1.0, 1.0]) / world.time_s[-1])
-    return _misread(world, node, rate * world.time_s)
+    return _misread(world, node, rate * world.time_s, {"d_K_per_s": rate})
 
 
 HIDDEN: dict[str, Callable[[World, int], Hidden]] = {

@@ -24,6 +24,7 @@ from twin_core.discover import close_loop
 from twin_core.discover.confirm import Trial, try_effects, try_on_trajectories
 from twin_core.discover.holdout import predict, split_fraction
 from twin_core.discover.screen import screen, survey_of
+from twin_core.discover.shortlist import refined
 from twin_core.effects import REGISTRY
 
 HOLDOUT = 0.3
@@ -83,20 +84,25 @@ def onset_error(case: Case, own: dict[str, Any] | None) -> float | None:
 
 def known_effect_error(case: Case) -> float:
     """Return the held-out error of the model whose effect and place are told, fitted to the same training part, in K."""
-    train, held = split_fraction([case.record], HOLDOUT)
-    fit, calibration = fit_network(case.spec, train)
+    best = known_effect_trial(case)
+    if best is None:
+        return float("nan")
+    model = to_model(best.calibration, best.present_effects)
+    held = split_fraction([case.record], HOLDOUT)[1]
+    residuals = [p.measured_K - p.predicted_K for p in (predict(model, h) for h in held)]
+    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
+
+
+def known_effect_trial(case: Case) -> Trial | None:
+    """Return the model whose effect and place are told, fitted to the training part from the best screened starts."""
+    fit, calibration = fit_network(case.spec, split_fraction([case.record], HOLDOUT)[0])
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
     survey = survey_of(fit)
     kind = REGISTRY[case.effect or ""]
-    probes = screen(fit, survey, kind.starts(case.where, survey)).probes[:3]
-    trials = [try_effects(base, [probe.effect], n_passes=15) for probe in probes]
-    trials += [t for probe in probes[:1] if (t := try_on_trajectories(base, [probe.effect])) is not None]
-    if not trials:
-        return float("nan")
-    best = min(trials, key=lambda t: float(np.nansum(np.concatenate(t.calibration.residuals) ** 2)))
-    model = to_model(best.calibration, best.present_effects)
-    residuals = [p.measured_K - p.predicted_K for p in (predict(model, h) for h in held)]
-    return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
+    starts = refined(fit, [probe.effect for probe in screen(fit, survey, kind.starts(case.where, survey)).probes[:3]])
+    trials = [try_effects(base, [start], n_passes=15) for start in starts]
+    trials += [t for start in starts[:1] if (t := try_on_trajectories(base, [start])) is not None]
+    return min(trials, key=lambda t: float(np.nansum(np.concatenate(t.calibration.residuals) ** 2)), default=None)
 
 
 def run_all(

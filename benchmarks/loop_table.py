@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.bands import bands
 from benchmarks.markdown import markdown_table, save_table
 
 Row = dict[str, Any]
-Z90 = 1.6448536269514722
 
 
 def save_tables(rows: Sequence[Row]) -> None:
@@ -61,14 +61,8 @@ def has_wrong_name(row: Row) -> bool:
 
 
 def in_band(row: Row) -> list[bool]:
-    """Return for every true parameter of a found effect whether its 90 % band holds it; settings have no band."""
-    held = []
-    for name, true in row["truth"].items():
-        found = (row["own"] or {}).get(name)
-        if name == "time" or not isinstance(true, float) or found is None or not isinstance(found["std"], float):
-            continue
-        held.append(abs(found["mean"] - true) <= Z90 * found["std"])
-    return held
+    """Return for every true parameter of a found effect whether its 90 % band holds it."""
+    return [band.holds for band in bands(row["truth"], row["own"])]
 
 
 def by_effect(rows: Sequence[Row]) -> str:

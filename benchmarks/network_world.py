@@ -48,7 +48,7 @@ class Hidden:
     switch: "Switch | None" = None
     offset_K: np.ndarray | None = None
     onset_s: float | None = None
-    parameters: dict[str, float] = field(default_factory=dict)
+    parameters: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import Json, Progress, no_progress
+from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
@@ -94,8 +95,12 @@ def close_loop(
 
 def corrected(found: Search) -> CalibratedModel:
     """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
-    survey = survey_of(found.trial.fit)
-    model = to_model(found.trial.calibration, found.trial.present_effects)
+    return centred(to_model(found.trial.calibration, found.trial.present_effects), found.trial.fit)
+
+
+def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:
+    """Return a model with what the record leaves open of its effects in the middle."""
+    survey = survey_of(fit)
     effects = tuple(effect.centred(survey) for effect in model.effects)
     moved = {p.name: p.value for effect in effects for p in effect.parameters()}
     return replace(model, effects=effects, values=model.values | moved)

@@ -74,7 +74,7 @@ class PeriodicHeatLoad(Effect):
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the null effect at the periods that stand out in what the node's sensors, or all, read beyond the model."""
-        settings = {"origin_s": float(survey.along.time_s[0]), "dated": survey.dated}
+        settings = {"origin_s": survey.begin_s, "dated": survey.dated}
         for period in standing_out_s(survey, where["node"]):
             yield cls(where, {"Q_W": 0.0, "A_W": 0.0, "B_W": 0.0, "P_s": period}, settings)
 

@@ -37,6 +37,15 @@ def test_a_line_in_the_residual_is_a_period_to_start_from(node: str, period_s: f
     assert all(e.values["P_s"] <= t[-1] - t[0] + 1e-6 for e in starts)
 
 
+def test_its_phase_counts_from_the_first_sample() -> None:
+    """Not from the first point of the rollout, which lies within the first step: 40 s are 6 degrees in 40 minutes."""
+    network = every_term_network()
+    along = points(network, 400)
+    line = np.sin(2.0 * np.pi * along.time_s / 2400.0)[:, None] * np.ones((1, 2))
+    survey = replace(survey_of(network, along), residual_K=line, sample_s=along.time_s - 40.0)
+    assert {e.settings["origin_s"] for e in LOAD.starts({"node": "a"}, survey)} == {float(along.time_s[0]) - 40.0}
+
+
 def test_a_residual_without_anything_gives_no_line() -> None:
     network = every_term_network()
     survey = survey_of(network, points(network, 100))
