@@ -9,6 +9,7 @@ from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import acceptance
 from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.discover.experiments import separating
 from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects.base import Effect
@@ -60,6 +61,7 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
     fitted = {effect.place: effect for effect in model.effects}
     rows = []
     for finding in sorted(findings, key=lambda f: -f.judged.evidence.log_bayes_factor):
+        experiments = [experiment.row() for experiment in separating(finding)]
         for effect in finding.effects:
             own = fitted[effect.place]
             rows.append(
@@ -79,6 +81,7 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
                         for option in finding.alternatives
                         for other in option.effects
                     ],
+                    "experiments": experiments,
                 }
             )
     return rows

@@ -98,6 +98,10 @@ class NodeHeat:
             "mean_W": float(self.mean_W.mean()),
             "std_W": self.band_W,
             "share_of_turnover": _rms(self.mean_W) / self.turnover_W if self.turnover_W > 0 else None,
+            "effect_mean_W": None if self.effect_W is None else float(self.effect_W.mean()),
+            "effect_share_of_turnover": None
+            if self.effect_W is None or self.turnover_W <= 0
+            else _rms(self.effect_W) / self.turnover_W,
             "correlation_with_effect": self.correlation,
             "agrees": self.agrees,
         }

@@ -1,0 +1,84 @@
+"""The experiment that would separate what the record cannot: what is promised is what SciPy integrates."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twin_core.calibrate.second_order import fit_network
+from twin_core.discover.confirm import Evidence, Trial, try_effects
+from twin_core.discover.experiments import separating
+from twin_core.discover.judge import Finding, Judged
+from twin_core.discover.screen import screen, survey_of
+from twin_core.effects.constant_heat_load import ConstantHeatLoad
+from twin_core.effects.leak_to_boundary import LeakToBoundary
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+CAPACITY, LOSS, LEAK, NOISE_K, WALL_K, POWER_W = 900.0, 1.5, 0.5, 0.05, 270.0, 40.0
+TIMES = 60.0 * np.arange(200)
+SPEC = TwinSpec.model_validate(
+    {
+        "twin": "t",
+        "boundaries": {"wall": {"value_K": WALL_K}, "room": {"value_K": 280.0}},
+        "channels": {
+            "T_a": {"kind": "temperature", "unit": "K", "noise_std": NOISE_K},
+            "Q": {"kind": "power", "unit": "W"},
+        },
+        "nodes": [{"id": "a", "sensor": "T_a", "capacity_J_per_K": {"value": CAPACITY}}],
+        "conductors": [{"between": ["a", "wall"], "conductance_W_per_K": {"value": LOSS}}],
+        "loads": [{"channel": "Q", "node": "a"}],
+    }
+)
+
+
+def readings(power: np.ndarray, start_K: float, leak: float, heat_W: float) -> np.ndarray:
+    """Integrate one node with a leak to the room and a constant heat, (n_times,)."""
+    out = [np.array([start_K])]
+    for k, watts in enumerate(power[:-1]):
+
+        def rate(_: float, x: np.ndarray, watts: float = watts) -> list[float]:
+            return [(watts + LOSS * (WALL_K - x[0]) + leak * (280.0 - x[0]) + heat_W) / CAPACITY]
+
+        out.append(solve_ivp(rate, TIMES[k : k + 2], out[-1], rtol=1e-10, atol=1e-10).y[:, -1])
+    return np.array(out)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def finding() -> Finding:
+    """A leak, and the constant heat that it looks like at a power that hardly moves."""
+    power = POWER_W + np.where(np.arange(TIMES.size) % 40 < 20, 0.5, -0.5)
+    measured = readings(power, 291.0, LEAK, 0.0) + NOISE_K * np.random.default_rng(0).normal(size=TIMES.size)
+    fit, calibration = fit_network(SPEC, [Record(TIMES, {"T_a": measured, "Q": power})])
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    survey = survey_of(fit)
+    starts = [
+        screen(fit, survey, kind.starts(where, survey)).probes[0].effect
+        for kind, where in ((LeakToBoundary, {"node": "a", "boundary": "room"}), (ConstantHeatLoad, {"node": "a"}))
+    ]
+    own, other = (Judged((e,), Evidence(9.0, 0.0), try_effects(base, [e], n_passes=15)) for e in starts)
+    return Finding(own, (other,))
+
+
+def test_promised_separation_is_what_scipy_integrates(finding: Finding) -> None:
+    off = next(e for e in separating(finding) if e.words.startswith("Q off for 5970"))
+    power = np.where(TIMES >= TIMES[-1] - 5970.0, 0.0, finding.judged.trial.fit.problem.segments[0].record.values["Q"])
+    paths = []
+    for judged in (finding.judged, finding.alternatives[0]):
+        values = judged.trial.calibration.network.parameters.as_dict()
+        leak = values.get("leak_to_boundary(a,room).G_W_per_K", 0.0)
+        heat = values.get("constant_heat_load(a).Q_W", 0.0)
+        start = float(judged.trial.calibration.optimum.fit.trajectories[0].start_K[0])
+        paths.append(readings(power, start, leak, heat))
+    assert off.apart_K == pytest.approx(np.sqrt(np.mean((paths[0] - paths[1]) ** 2)), rel=5e-3)
+    assert off.apart_std == pytest.approx(off.apart_K / NOISE_K)
+    assert off.decides and off.sensor == "T_a"
+
+
+def test_moving_the_input_tells_more_than_the_same_again(finding: Finding) -> None:
+    best, *_, worst = separating(finding)
+    assert best.words.startswith("Q off")
+    assert best.apart_std >= worst.apart_std
+
+
+def test_nothing_to_separate_without_an_alternative(finding: Finding) -> None:
+    assert separating(Finding(finding.judged)) == []
