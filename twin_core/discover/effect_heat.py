@@ -4,8 +4,10 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.discover.judge import Search
-from twin_core.effects.base import touched_nodes
+from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.model import Network
+from twin_core.network.terms import Along
 
 MAX_NODES = 4
 """Nodes of interest at most."""
@@ -44,18 +46,21 @@ def effect_heat(search: Search, states_K: FloatArray, first_step: int) -> FloatA
         return None
     network = search.trial.calibration.network
     forcing = search.trial.fit.problem.segments[-1].forcing
-    values = network.parameters.values
     last = first_step + states_K.shape[0]
     stages = search.trial.calibration.optimum.fit.trajectories[-1].stages_K[first_step:last].copy()
     declared = search.base.fit.problem.n_nodes
     stages[:, :, :declared] = states_K[:, None, :]
-    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first_step, last))
+    boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(first_step, last))
     along = forcing.along(stages.reshape(-1, stages.shape[2]), boundaries, first_step, last)
-    total, told = np.zeros((2 * states_K.shape[0], len(network.nodes))), np.zeros(len(network.nodes), dtype=bool)
-    for effect in search.trial.effects:
-        for term in effect.addition(network.layout).terms:
-            part = term.evaluate(along, values[network.term_index(term)])
-            total[:, list(part.nodes)] += part.heat_W
-            told[list(part.nodes)] = True
-    total[:, ~told] = np.nan
+    total = np.sum([_heat_of(effect, network, along) for effect in search.trial.effects], axis=0)
+    total[:, ~total.any(axis=0)] = np.nan
     return total[1::2, :declared]
+
+
+def _heat_of(effect: Effect, network: Network, along: Along) -> FloatArray:
+    """Return the heat of an effect of a network at the network's own values, (n_points, n_nodes)."""
+    total = np.zeros((along.time_s.size, len(network.nodes)))
+    for term in effect.addition(network.layout).terms:
+        part = term.evaluate(along, network.parameters.values[network.term_index(term)])
+        total[:, list(part.nodes)] += part.heat_W
+    return total

@@ -1,12 +1,36 @@
-"""The form of a finding: a name stands for a law, so nothing that repeats with temperature may be left where it acts."""
+"""The form of a finding: a name stands for a law, so nothing that repeats with temperature may be left where it acts,
+and the declared quantities must be left where they may be."""
 
 from collections.abc import Sequence
 
 from twin_core.discover.confirm import Trial, try_effects, weigh
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, screened, shortlist
 from twin_core.effects.base import Effect, touched_nodes
+from twin_core.parameters.transforms import Log
 
 N_REFITS = 3
+FAR_STD = 3.0
+"""A declared guess counts as left behind beyond so many standard deviations of its prior: a factor of twenty."""
+
+
+def leaves_declaration(simple: Trial, rich: Trial) -> bool:
+    """Return whether effects hold only where a declared guess is far off, which the simpler model left in its place.
+
+    A node whose capacity and couplings grow twenty-fold can take any heat: the effects then describe another spacecraft.
+    """
+    before = _prior_distances(simple)
+    return any(z > FAR_STD and z > before.get(name, 0.0) for name, z in _prior_distances(rich).items())
+
+
+def _prior_distances(trial: Trial) -> dict[str, float]:
+    """Return how far the fitted values lie from what was declared, in standard deviations of the prior."""
+    free, parameters = trial.calibration.optimum.unknowns, trial.fit.problem.network.parameters
+    declared = [parameters.parameters[i] for i in parameters.free_index]
+    return {
+        p.name: abs(float(value) - p.free) / p.prior_std
+        for p, value in zip(declared, free[: len(declared)], strict=True)
+        if p.prior_std and not p.guessed and p.transform == Log()
+    }
 
 
 def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: float) -> bool:

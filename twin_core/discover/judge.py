@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
-from twin_core.discover.form import leaves_a_repeatable_heat
+from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
 from twin_core.effects.base import Effect
 
 N_VALIDATED = 3
@@ -93,7 +93,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             own.validation is not None
             and is_valid(own.validation, len(own.effects))
             and is_told(own)
-            and _is_named_well(own, needed)
+            and _is_sound(state.trial, own, needed)
         ):
             close = [j for j in judged if j is not best and j not in failed and is_close(j, best)]
             state.trial = best.trial
@@ -105,8 +105,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def _is_named_well(judged: Judged, needed: float) -> bool:
-    """Return whether the effects are a law that holds, or make no claim to be one."""
+def _is_sound(simple: Trial, judged: Judged, needed: float) -> bool:
+    """Return whether effects leave the declaration standing, and are a law that holds or make no claim to be one."""
+    if leaves_declaration(simple, judged.trial):
+        return False
     named = [effect for effect in judged.effects if not effect.fallback]
     return not named or not leaves_a_repeatable_heat(judged.trial, named, needed)
 

@@ -8,9 +8,10 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Trial, try_effects, weigh
-from twin_core.discover.form import leaves_a_repeatable_heat
+from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
 from twin_core.discover.judge import threshold
 from twin_core.discover.screen import screen, survey_of
+from twin_core.effects.input_gain import InputGain
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
@@ -44,8 +45,8 @@ def resonance(temperature_K: float) -> float:
     return 12.0 * float(np.exp(-0.5 * ((temperature_K - 281.0) / 4.0) ** 2))
 
 
-def named(heat_W: Callable[[float], float]) -> tuple[Trial, Trial]:
-    """Return the declared model, and that with a proportional heater, fitted to readings of a world with hidden heat."""
+def record_of(heat_W: Callable[[float], float]) -> Record:
+    """Return the readings of a world with hidden heat."""
     readings = [np.array([282.0])]
     for k, power in enumerate(POWER[:-1]):
 
@@ -54,10 +55,19 @@ def named(heat_W: Callable[[float], float]) -> tuple[Trial, Trial]:
 
         readings.append(solve_ivp(rate, TIMES[k : k + 2], readings[-1], rtol=1e-9, atol=1e-9).y[:, -1])
     noise = NOISE_K * np.random.default_rng(1).normal(size=TIMES.size)
-    record = Record(TIMES, {"T_a": np.array(readings)[:, 0] + noise, "Q": POWER})
-    fit, calibration = fit_network(SPEC, [record])
-    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
-    survey = survey_of(fit)
+    return Record(TIMES, {"T_a": np.array(readings)[:, 0] + noise, "Q": POWER})
+
+
+def declared(spec: TwinSpec, record: Record) -> Trial:
+    """Return the declared model, fitted."""
+    fit, calibration = fit_network(spec, [record])
+    return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+
+
+def named(heat_W: Callable[[float], float]) -> tuple[Trial, Trial]:
+    """Return the declared model, and that with a proportional heater, fitted to readings of a world with hidden heat."""
+    base = declared(SPEC, record_of(heat_W))
+    fit, survey = base.fit, survey_of(base.fit)
     probes = screen(fit, survey, ProportionalHeater.starts({"node": "a"}, survey)).probes[:3]
     trials = [try_effects(base, [probe.effect], n_passes=15) for probe in probes]
     return base, max(trials, key=lambda trial: trial.fit.log_posterior)
@@ -68,3 +78,15 @@ def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[
     base, trial = named(heat_W)
     assert weigh(base, trial, 1).log_bayes_factor > NEEDED  # either way the heater looks well supported
     assert leaves_a_repeatable_heat(trial, trial.effects, NEEDED) is left
+
+
+def test_an_effect_that_rescales_its_node_leaves_the_declaration() -> None:
+    far = 30.0  # one input scales everything: thirty-fold guesses and a gain of thirty say the same as the truth
+    raw = SPEC.model_dump(mode="json", exclude_none=True)
+    raw["nodes"][0]["capacity_J_per_K"] = {"guess": far * CAPACITY}
+    raw["conductors"][0]["conductance_W_per_K"] = {"guess": far * LEAK}
+    at_truth = declared(TwinSpec.model_validate(raw), record_of(lambda _: 0.0))
+    at_guess = try_effects(at_truth, [InputGain({"channel": "Q"}, {"g": far})], n_passes=15)
+    assert at_guess.effects[0].values["g"] > 5.0  # drawn towards the guesses, though not by the readings
+    assert leaves_declaration(at_guess, at_truth)
+    assert not leaves_declaration(at_truth, at_guess)
