@@ -13,6 +13,7 @@ from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
 from service.deps import Service
 from service.heads import Heads
+from service.intake import Intake
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
@@ -29,7 +30,8 @@ from service.workbench import Workbench
 log = logging.getLogger("service")
 
 ROUTERS = (
-    telemetry.router,  # first: routes are looked up in this order, and this one is asked for most
+    telemetry.ingesting,  # first: routes are looked up in this order, and this one is asked for most
+    telemetry.router,
     health.router,
     twins.router,
     jobs.calibrations,
@@ -54,7 +56,8 @@ async def _running(
     runner = Jobs(
         database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
     )
-    service = Service(settings, database, Registry(()), metrics, hub, live_state, runner)
+    intake = Intake(hub, live_state, metrics)
+    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
     schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)

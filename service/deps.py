@@ -11,6 +11,7 @@ from fastapi import Depends, Path
 from starlette.requests import HTTPConnection
 
 from service.access import Role
+from service.intake import Intake
 from service.jobs.runner import Jobs
 from service.live.live import Live
 from service.metrics import Metrics
@@ -34,6 +35,7 @@ class Service:
     metrics: Metrics
     hub: Hub
     live: Live
+    intake: Intake
     jobs: Jobs
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 

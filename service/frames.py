@@ -1,10 +1,13 @@
 """Telemetry bodies -> one batch of arrays: JSON columns or NDJSON frames, refused whole if anything is malformed."""
 
+import contextlib
 import json
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from itertools import chain
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import orjson
@@ -51,17 +54,26 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
     if not isinstance(times, list):
         raise BadField("time", "must be a list")
     _check_units(document.get("units", {}), channels)
-    positions = {name: row for row, name in enumerate(channels)}
-    rows = [_position(positions, name, f"values.{name}") for name in columns]
+    n_times, names = len(times), list(channels)
     for name, column in columns.items():
-        if not isinstance(column, list):
-            raise BadField(f"values.{name}", "must be a list with one value or null per time")
-        if len(column) != len(times):
-            raise BadField(f"values.{name}", f"has {len(column)} values, time has {len(times)}")
-    values = np.full((len(channels), len(times)), np.nan)
-    if rows:
-        values[rows] = _matrix(columns)
+        if name not in channels or type(column) is not list or len(column) != n_times:
+            _refuse_column(name, column, n_times, channels)
+    values = np.full((len(names), n_times), np.nan)
+    if columns:
+        matrix = _matrix(columns, may_hold_booleans=b"true" in body or b"false" in body)
+        if list(columns) == names:
+            values = matrix
+        else:
+            values[[names.index(name) for name in columns]] = matrix
     return Batch(parse_instants(times), values)
+
+
+def _refuse_column(name: str, column: Any, n_times: int, channels: Units) -> NoReturn:
+    """Say what is wrong with a column."""
+    _position(channels, name, f"values.{name}")
+    if not isinstance(column, list):
+        raise BadField(f"values.{name}", "must be a list with one value or null per time")
+    raise BadField(f"values.{name}", f"has {len(column)} values, time has {n_times}")
 
 
 def _check_units(units: Any, channels: Units) -> None:
@@ -80,12 +92,17 @@ def _show(value: Any) -> str:
     return json.dumps(value)[:60]
 
 
-def _matrix(columns: dict[str, list[Any]]) -> NDArray[np.float64]:
-    """Return equally long columns as one array, (n_columns, n_times); the slow way only where something is wrong."""
-    if all(_NUMBERS.issuperset(map(type, column)) for column in columns.values()):
-        matrix = np.array(list(columns.values()), dtype=np.float64)
-        if not np.isinf(matrix).any():
-            return matrix
+def _matrix(columns: dict[str, list[Any]], *, may_hold_booleans: bool) -> NDArray[np.float64]:
+    """Return equally long columns as one array, (n_columns, n_times); the slow way where not all are finite numbers.
+
+    Packing takes a third of the time of looking at types, and refuses all that is no number but true and false.
+    """
+    if not may_hold_booleans:
+        numbers = [*chain.from_iterable(columns.values())]
+        with contextlib.suppress(struct.error, OverflowError):
+            matrix = np.frombuffer(struct.pack(f"{len(numbers)}d", *numbers)).reshape(len(columns), -1)
+            if np.isfinite(matrix).all():
+                return matrix
     return np.stack([_numbers(column, partial(_element, name)) for name, column in columns.items()])
 
 

@@ -17,7 +17,9 @@ FIRST_US = 0
 LAST_US = 7_258_118_400_000_000 - 1
 """The last microsecond before 2200-01-01: later times are mistaken units, such as milliseconds."""
 
+_LAST_S = float(LAST_US // 1_000_000)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_EPOCH_UTC = datetime(1970, 1, 1)
 _RFC3339 = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,18}))?([Zz]|[+-]\d\d:\d\d)", re.ASCII)
 _FORM = "write RFC 3339 such as 2026-01-03T00:00:00Z, or unix seconds"
 _BLOCK = 32
@@ -34,7 +36,10 @@ def parse_instants(values: Sequence[Any], field: str = "time") -> Instants:
     """
     kinds = set(map(type, values))
     if kinds <= {float, int}:
-        instants = _from_seconds(values, field)
+        seconds = np.array(values, dtype=np.float64)
+        if ((seconds >= 0.0) & (seconds < _LAST_S)).all():
+            return np.rint(seconds * 1e6).astype(np.int64)
+        instants = _from_seconds(seconds, field)
     else:
         block = _parse_block(values) if kinds == {str} and len(values) >= _BLOCK else None
         instants = block if block is not None else _parse_each(values, field)
@@ -67,11 +72,10 @@ def _show(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _from_seconds(values: Sequence[Any], field: str) -> Instants:
-    seconds = np.array(values, dtype=np.float64)
+def _from_seconds(seconds: NDArray[np.float64], field: str) -> Instants:
     if not np.isfinite(seconds).all():
         raise BadField(f"{field}[{int(np.argmin(np.isfinite(seconds)))}]", "is not a finite number")
-    return np.rint(np.clip(seconds, -1e12, 1e12) * 1e6).astype(np.int64)
+    return np.rint(seconds.clip(-1e12, 1e12) * 1e6).astype(np.int64)
 
 
 def _parse_each(values: Sequence[Any], field: str) -> Instants:
@@ -154,7 +158,7 @@ def format_instants(instants: Instants) -> list[str]:
 
 def format_instant(instant: int) -> str:
     """Return one instant as RFC 3339 UTC."""
-    return format_instants(np.array([instant], dtype=np.int64))[0]
+    return f"{(_EPOCH_UTC + timedelta(microseconds=instant)).isoformat()}Z"
 
 
 def now_us() -> int:

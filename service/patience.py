@@ -1,19 +1,22 @@
-"""Connections that open and then say too little, too slowly, are closed: they would otherwise be kept for ever."""
+"""Connections that open and then say too little, too slowly, or without end are closed: they would be kept for ever."""
 
 import asyncio
 from typing import Any, ClassVar
 
-import h11
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from service.problems import MEDIA_TYPE, document
 
+MOST_HEAD_BYTES = 64 * 1024
 
-class PatientProtocol(H11Protocol):
-    """HTTP/1.1 whose request heads must be complete within ``patience_s``; bodies have a limit of their own."""
+
+class PatientProtocol(HttpToolsProtocol):
+    """HTTP/1.1 whose request heads are short and complete within ``patience_s``; bodies have limits of their own."""
 
     patience_s: ClassVar[float] = 30.0
     _deadline: asyncio.TimerHandle | None = None
+    _head_bytes = 0
+    _in_body = False
 
     def connection_made(self, transport: Any) -> None:
         """Wait for the first request."""
@@ -27,30 +30,45 @@ class PatientProtocol(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Begin to wait with the first bytes of a later request: the keep-alive timer ends there."""
-        if self._deadline is None and self.conn.their_state is h11.IDLE:
+        if not self._in_body:
+            self._head_bytes += len(data)
             self._wait()
-        before = self.cycle
         super().data_received(data)
-        if self.cycle is not before:
-            self._stop()
+        if not self._in_body and self._head_bytes > MOST_HEAD_BYTES:
+            self.send_400_response(f"the head of a request must not exceed {MOST_HEAD_BYTES} bytes")
+
+    def on_message_begin(self) -> None:
+        """Wait for the rest of the head."""
+        super().on_message_begin()
+        self._wait()
+
+    def on_headers_complete(self) -> None:
+        """Wait no more: the head was complete. A request that names no host, or two, is none."""
+        hosts = sum(name == b"host" for name, _ in self.headers)
+        if hosts > 1 or (hosts == 0 and self.parser.get_http_version() == "1.1"):
+            raise ValueError("one Host is needed")  # the parser takes this for a malformed request
+        self._stop()
+        self._in_body = True
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Expect the head of another request."""
+        self._in_body = False
+        super().on_message_complete()
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP as every other error is answered."""
         body = document(400, msg)
-        headers = [("content-type", MEDIA_TYPE), ("content-length", str(len(body))), ("connection", "close")]
-        for event in (h11.Response(status_code=400, headers=headers), h11.Data(data=body), h11.EndOfMessage()):
-            self.transport.write(self.conn.send(event) or b"")
+        head = f"content-type: {MEDIA_TYPE}\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+        self.transport.write(b"HTTP/1.1 400 Bad Request\r\n" + head.encode() + body)
         self.transport.close()
 
-    def handle_websocket_upgrade(self, event: h11.Request) -> None:
-        """Wait no more: the head was complete."""
-        self._stop()
-        super().handle_websocket_upgrade(event)
-
     def _wait(self) -> None:
-        self._deadline = self.loop.call_later(self.patience_s, self.transport.close)
+        if self._deadline is None:
+            self._deadline = self.loop.call_later(self.patience_s, self.transport.close)
 
     def _stop(self) -> None:
+        self._head_bytes = 0
         if self._deadline is not None:
             self._deadline.cancel()
             self._deadline = None

@@ -1,27 +1,28 @@
 """Telemetry: take samples in, give the archive out."""
 
 import asyncio
-import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.routing import APIRoute
 
 from service.access import Role
 from service.deps import NamedTwin, Running, Service, TwinName, reads, require
 from service.downsample import extremes
-from service.frames import Batch, parse_columns, parse_frames
-from service.instants import Instants, format_instant, format_instants, parse_parameter
-from service.messages import SampleStretch
+from service.frames import parse_columns, parse_frames
+from service.instants import format_instant, format_instants, parse_parameter
 from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Archive, IngestReport, Posted
 from service.store import samples
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
 from service.store.samples import Receipt, Samples
 
-router = APIRouter(prefix="/v1/twins/{twin}/telemetry", tags=["telemetry"])
+PREFIX = "/v1/twins/{twin}/telemetry"
+router = APIRouter(prefix=PREFIX, tags=["telemetry"])
 
 NDJSON = "application/x-ndjson"
 PARSE_APART_BYTES = 512 * 1024
@@ -37,10 +38,26 @@ _BODY = {
 }
 
 
-@router.post("", response_model=IngestReport, openapi_extra=_BODY)
+class _Direct(APIRoute):
+    """A route that is handed its request as it is: resolving dependencies costs more than the parsing of a sample."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return the endpoint itself."""
+
+        async def handle(request: Request) -> Response:
+            answer: Response = await self.endpoint(request, request.path_params["twin"])
+            return answer
+
+        return handle
+
+
+ingesting = APIRouter(prefix=PREFIX, tags=["telemetry"], route_class=_Direct)
+
+
+@ingesting.post("", response_model=IngestReport, openapi_extra=_BODY)
 async def ingest(request: Request, twin: TwinName) -> Response:
     """Store samples durably, then answer what became of each; a malformed body is refused whole."""
-    require(request, Role.ingest)  # by hand, as everything here: resolving dependencies costs as much as the parsing
+    require(request, Role.ingest)
     service: Service = request.app.state.service
     entry = service.registry.get(twin)
     body = await request.body()
@@ -50,23 +67,8 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     else:
         batch = parse(body, entry.units)
     entry.refuse_implausible(batch.values)
-    receipt, accepted = await service.hub.write(entry.key, _store, entry, batch)
-    if accepted.size:
-        service.live.arrived(entry, accepted)
-    report = _report(receipt, int(accepted.size))
-    _count(service, twin, report)
-    return Response(orjson.dumps(report), media_type="application/json")
-
-
-def _store(
-    connection: sqlite3.Connection, twin: Entry, batch: Batch
-) -> tuple[tuple[Receipt, Instants], Sequence[SampleStretch]]:
-    """Store a batch; return what became of it with the instants that were stored, and what the stream hears."""
-    receipt = samples.append(connection, twin.key, batch)
-    kept = receipt.stored
-    time_us, values = (batch.time_us, batch.values) if kept.all() else (batch.time_us[kept], batch.values[:, kept])
-    seqs = np.arange(receipt.first_seq, receipt.first_seq + time_us.size)
-    return (receipt, time_us), [SampleStretch(twin.channels, seqs, time_us, values)]
+    receipt = await service.intake.store(entry, batch)
+    return Response(orjson.dumps(_report(receipt)), media_type="application/json")
 
 
 def _parser(content_type: str) -> Any:
@@ -78,20 +80,15 @@ def _parser(content_type: str) -> Any:
     raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{media[:60]}'")
 
 
-def _report(receipt: Receipt, n_accepted: int) -> dict[str, Any]:
+def _report(receipt: Receipt) -> dict[str, Any]:
+    counts = receipt.counts
+    conflicts = receipt.conflicts if counts[CONFLICT] else []
     return {
-        "accepted": n_accepted,
-        "duplicates": receipt.duplicates,
-        "rejected": [{"index": index, "reason": reason} for index, reason in receipt.rejected],
+        "accepted": counts[ACCEPTED],
+        "duplicates": counts[DUPLICATE],
+        "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
-
-
-def _count(service: Service, twin: str, report: dict[str, Any]) -> None:
-    outcomes = {"accepted": report["accepted"], "duplicate": report["duplicates"], "rejected": len(report["rejected"])}
-    for outcome, count in outcomes.items():
-        if count:
-            service.metrics.samples.labels(twin, outcome).inc(count)
 
 
 @router.get("", dependencies=[reads], response_model=Archive)

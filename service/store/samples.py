@@ -7,6 +7,7 @@ A chunk holds three arrays as little-endian bytes: the stream numbers and instan
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from service.frames import Batch
 from service.store import outline
 from service.store.gone import TwinGone
-from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, collapse, merge
+from service.store.merge import ACCEPTED, CONFLICT, collapse, merge
 
 SMALL = 512
 """Chunks with fewer rows than this are compacted."""
@@ -38,14 +39,16 @@ class Receipt:
         return self.status == ACCEPTED
 
     @property
-    def duplicates(self) -> int:
-        """How many samples were known already."""
-        return int(np.count_nonzero(self.status == DUPLICATE))
+    def counts(self) -> list[int]:
+        """How many samples have each status."""
+        counts: list[int] = np.bincount(self.status, minlength=CONFLICT + 1).tolist()
+        return counts
 
     @property
-    def rejected(self) -> list[tuple[int, str]]:
-        """Where the samples stand that were not taken in, and why: they contradict the archive."""
-        return [(i, "conflict") for i in np.flatnonzero(self.status == CONFLICT).tolist()]
+    def conflicts(self) -> list[int]:
+        """Where the samples stand that contradict the archive."""
+        conflicts: list[int] = np.flatnonzero(self.status == CONFLICT).tolist()
+        return conflicts
 
 
 @dataclass(frozen=True)
@@ -147,18 +150,20 @@ def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> Non
         "SELECT id, seq, time, value FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
     ).fetchall()
     time_us = np.concatenate([np.frombuffer(row[2], dtype="<i8") for row in rows])
-    order = np.argsort(time_us, kind="stable")
-    time_us = time_us[order]
-    seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])[order]
-    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)[:, order]
-    connection.executemany("DELETE FROM chunk WHERE id = ?", [(row[0],) for row in rows])
+    seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])
+    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)
     steps = np.diff(time_us)
+    if (steps < 0).any():
+        order = np.argsort(time_us, kind="stable")
+        time_us, seq, values = time_us[order], seq[order], values[:, order]
+        steps = np.diff(time_us)
+    connection.executemany("DELETE FROM chunk WHERE id = ?", [(row[0],) for row in rows])
     cuts = np.flatnonzero(steps > max(int(time_us[-1] - time_us[0]) // MOST_CUTS, 1)) + 1
     remaining = [0, 0]
-    for part in np.split(np.arange(time_us.size), cuts):
-        _insert(connection, twin, seq[part], time_us[part], values[:, part])
-        if part.size < SMALL:
-            remaining = [remaining[0] + 1, remaining[1] + part.size]
+    for first, stop in pairwise([0, *cuts.tolist(), time_us.size]):
+        _insert(connection, twin, seq[first:stop], time_us[first:stop], values[:, first:stop])
+        if stop - first < SMALL:
+            remaining = [remaining[0] + 1, remaining[1] + stop - first]
     connection.execute("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", (*remaining, twin))
 
 

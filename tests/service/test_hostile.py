@@ -73,8 +73,15 @@ def test_slow_callers_are_let_go_and_others_are_served(server: Server, first: by
         b"GET /healthz HTTP/1.1\r\n\r\n",
         f"POST {ROUTE} HTTP/1.1\r\nHost: x\r\nContent-Length: many\r\n\r\n".encode(),
         b"GET /healthz HTTP/1.1\r\nHost: x\r\nX: " + b"a" * 200_000,
+        b"GET /healthz HTTP/1.1\r\nHost: x\r\nHost: y\r\n\r\n",
+        f"POST {ROUTE} HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n{{}}".encode(),
+        f"POST {ROUTE} HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{{}}".encode(),
+        b"GET /healthz HTTP/1.1\r\nHost: x\r\nX : y\r\n\r\n",
     ],
-    ids=["no request", "no host", "no length", "endless head"],
+    ids=[
+        *("no request", "no host", "no length", "endless head"),
+        *("two hosts", "length and chunks", "two lengths", "blank before a colon"),
+    ],
 )
 def test_what_is_no_http_is_told_so_as_any_other_problem(server: Server, head: bytes) -> None:
     with dial(server) as connection:

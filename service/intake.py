@@ -1,0 +1,109 @@
+"""The intake: batches of a twin that arrive while a commit is under way wait for it and share the next one.
+
+What a commit costs beside the disk (statements, hand-overs between threads) is thus paid once for many small requests.
+"""
+
+import asyncio
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from service.frames import Batch
+from service.live.live import Live
+from service.messages import SampleStretch
+from service.metrics import Metrics
+from service.registry import Entry
+from service.store import samples
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
+from service.store.samples import Receipt
+from service.streams import Hub
+
+OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT}
+
+
+@dataclass(frozen=True)
+class _Ticket:
+    """A batch that waits to be stored, and where its receipt goes."""
+
+    batch: Batch
+    receipt: "asyncio.Future[Receipt]"
+
+
+class Intake:
+    """Stores samples, each twin's in the order of their arrival."""
+
+    def __init__(self, hub: Hub, live: Live, metrics: Metrics) -> None:
+        """Tell streams, trackers and metrics what was stored."""
+        self._hub, self._live, self._metrics = hub, live, metrics
+        self._loop = asyncio.get_running_loop()
+        self._lines: dict[int, list[_Ticket]] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def store(self, twin: Entry, batch: Batch) -> Receipt:
+        """Return what became of a batch, once it is durably committed."""
+        ticket = _Ticket(batch, self._loop.create_future())
+        line = self._lines.get(twin.key)
+        if line is not None:
+            line.append(ticket)
+        else:
+            self._lines[twin.key] = [ticket]
+            task = self._loop.create_task(self._serve(twin))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        return await ticket.receipt
+
+    async def _serve(self, twin: Entry) -> None:
+        """Store whatever waits, commit after commit, until nothing does."""
+        while tickets := self._lines[twin.key]:
+            self._lines[twin.key] = []
+            await self._store(twin, tickets)
+        del self._lines[twin.key]
+
+    async def _store(self, twin: Entry, tickets: list[_Ticket]) -> None:
+        batch = _joined([ticket.batch for ticket in tickets])
+        try:
+            receipt = await self._hub.write(twin.key, _append, twin, batch)
+        except Exception as error:
+            for ticket in tickets:
+                if not ticket.receipt.done():  # its caller may have gone
+                    ticket.receipt.set_exception(error)
+            return
+        self._tell(twin, batch, receipt)
+        first = 0
+        for ticket in tickets:
+            stop = first + ticket.batch.time_us.size
+            if not ticket.receipt.done():
+                own = receipt if len(tickets) == 1 else replace(receipt, status=receipt.status[first:stop])
+                ticket.receipt.set_result(own)
+            first = stop
+
+    def _tell(self, twin: Entry, batch: Batch, receipt: Receipt) -> None:
+        counts = receipt.counts
+        for outcome, status in OUTCOMES.items():
+            if counts[status]:
+                self._metrics.samples.labels(twin.name, outcome).inc(counts[status])
+        if counts[ACCEPTED]:
+            self._live.arrived(twin, batch.time_us[receipt.stored])
+
+
+def _joined(batches: list[Batch]) -> Batch:
+    """Return batches as one, in their order."""
+    if len(batches) == 1:
+        return batches[0]
+    times, values = [batch.time_us for batch in batches], [batch.values for batch in batches]
+    return Batch(np.concatenate(times), np.concatenate(values, axis=1))
+
+
+def _append(connection: sqlite3.Connection, twin: Entry, batch: Batch) -> tuple[Receipt, Sequence[SampleStretch]]:
+    """Store a batch; return what became of it, and what the stream hears."""
+    receipt = samples.append(connection, twin.key, batch)
+    n_stored = receipt.counts[ACCEPTED]
+    if n_stored == 0:
+        return receipt, ()
+    time_us, values = batch.time_us, batch.values
+    if n_stored < time_us.size:
+        time_us, values = time_us[receipt.stored], values[:, receipt.stored]
+    seqs = np.arange(receipt.first_seq, receipt.first_seq + n_stored)
+    return receipt, (SampleStretch(twin.channels, seqs, time_us, values),)
