@@ -173,7 +173,7 @@ def _matrix(blob: bytes, n_rows: int) -> NDArray[np.float64]:
 
 def _around(connection: sqlite3.Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
-    instants = np.unique(batch.time_us)
+    instants, n_rows = np.unique(batch.time_us), batch.values.shape[0]
     spans = np.array(
         connection.execute(
             "SELECT id, first_us, last_us FROM chunk WHERE twin = ? AND last_us >= ? AND first_us <= ?",
@@ -182,15 +182,29 @@ def _around(connection: sqlite3.Connection, twin: int, batch: Batch) -> tuple[ND
         dtype=np.int64,
     ).reshape(-1, 3)
     hit = np.searchsorted(instants, spans[:, 1]) < np.searchsorted(instants, spans[:, 2], side="right")
-    times, values = [np.empty(0, dtype=np.int64)], [np.empty((batch.values.shape[0], 0))]
-    for (chunk,) in spans[hit, :1].tolist():
-        time, value = connection.execute("SELECT time, value FROM chunk WHERE id = ?", (chunk,)).fetchone()
-        time_us = np.frombuffer(time, dtype="<i8")
-        wanted = np.isin(time_us, instants)
-        times.append(time_us[wanted])
-        values.append(_matrix(value, batch.values.shape[0])[:, wanted])
+    ids = ",".join(map(str, spans[hit, 0].tolist()))
+    chunks = connection.execute(f"SELECT id, time FROM chunk WHERE id IN ({ids})").fetchall()
+    stored = [np.frombuffer(time, dtype="<i8") for _, time in chunks]
+    times, values = [np.empty(0, dtype=np.int64)], [np.empty((n_rows, 0))]
+    for (chunk, _), time_us, wanted in zip(chunks, stored, _found_in(stored, instants), strict=True):
+        if wanted.any():
+            value = connection.execute("SELECT value FROM chunk WHERE id = ?", (chunk,)).fetchone()[0]
+            times.append(time_us[wanted])
+            values.append(_matrix(value, n_rows)[:, wanted])
     time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
     return collapse(time_us, matrix) if time_us.size else (time_us, matrix)
+
+
+def _found_in(stored: list[NDArray[np.int64]], instants: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
+    """Return for each array which of its elements are among some instants, which increase; all arrays at once."""
+    if not stored:
+        return []
+    joined = np.concatenate(stored)
+    place = np.searchsorted(instants, joined)
+    found = instants[np.minimum(place, instants.size - 1)] == joined
+    if not found.any():
+        return [np.zeros(0, dtype=np.bool_)] * len(stored)
+    return np.split(found, np.cumsum([time_us.size for time_us in stored[:-1]]))
 
 
 def select(

@@ -46,7 +46,9 @@ def test_a_refused_request_harms_no_other(registered: AppClient) -> None:
     async def send() -> list[httpx.Response]:
         good = [{"time": [k], "values": {"T_px": [290]}} for k in range(20)]
         bad = [{"time": [k], "values": {"T_px": ["290"]}} for k in range(20)]
-        return await asyncio.gather(*(registered.http.post(ROUTE, json=b) for pair in zip(good, bad) for b in pair))
+        return await asyncio.gather(
+            *(registered.http.post(ROUTE, json=b) for pair in zip(good, bad, strict=True) for b in pair)
+        )
 
     statuses = [answer.status_code for answer in registered.portal.call(send)]
     assert statuses == [200, 422] * 20
