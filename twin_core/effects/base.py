@@ -41,6 +41,8 @@ class Quality:
         Weak prior around the starting value, in ln for positive ones, in scales for instants; None = flat.
     lower
         The least value, itself possible; None where there is none or the value is positive anyway.
+    leap
+        How far one step of a solver may take a value of either sign: its slope is told by single events; None where any.
     resolution
         Standard deviation of what no fit to this telemetry can tell: it adds to that of the fit.
     instant
@@ -56,6 +58,7 @@ class Quality:
     prior_std: float | None = None
     lower: float | None = None
     instant: Shifted | None = None
+    leap: float | None = None
     resolution: float = 0.0
     open_ended: bool = False
 
@@ -64,6 +67,8 @@ class Quality:
         """How a solver moves it."""
         if self.positive:
             return Log()
+        if self.leap is not None:
+            return Shifted(0.0, self.leap)
         return self.instant or (Identity() if self.lower is None else Floored(self.lower))
 
     def spread(self, fitted: float) -> float:

@@ -17,12 +17,15 @@ ON_QUANTILES = (0.005, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
 OFF_QUANTILES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95)
 """Temperatures dwell at the lower threshold of a heater that keeps them from falling, so it is looked for more finely."""
 LEAST_BAND_K = 0.3
-LEAST_WIDTH_K, WIDTH_QUANTILE = 0.02, 0.8
-"""The first point beyond a threshold has switched in part: all the way at the distance that a node moves between two
-points at most times, so that the instant of switching is felt between the points."""
+LEAST_TRAVEL_K, RATE_QUANTILE = 0.005, 0.8
+"""A node that moves less between two points counts as moving this far: its slope with a threshold is bounded."""
 
-DELAY_SHARE = 0.002
-"""Time constant of the memory over the sampling interval: it has settled a step after each switching."""
+LEAP_K = 1.0
+"""One step of a solver moves a threshold this far at most: its slope is felt at the switchings alone."""
+
+DELAY_SHARE, UNSETTLED = 0.002, 0.02
+"""Time constant of the memory over the sampling interval: a point after each switching, all but a hundredth is done, and that
+counts as done."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Switching:
     Attributes
     ----------
     share
-        Share of full power over the interval that ends at the point.
+        Share of full power: in a step that switches, what makes the heat of the step right, which may be more than all.
     by_memory
         Its slope with the share that is remembered at the same point.
     by_on, by_off
@@ -50,39 +53,58 @@ class Switching:
 
 
 def switching(
-    temperature_K: FloatArray, on_K: float, off_K: float, width_K: float, remembered: FloatArray
+    time_s: FloatArray,
+    temperature_K: FloatArray,
+    on_K: float,
+    off_K: float,
+    remembered: FloatArray,
+    rate_K_per_s: float,
 ) -> Switching:
     """Return how a thermostat switches along a temperature.
 
+    A threshold is crossed between two points, at the instant that a straight line tells. A point's heat counts in its step
+    for as long as the other point of the pair stands for, so each point of a step that switches has its share scaled from
+    the one to the other: the step then receives the heat from that instant on, and the share is continuous in it.
+
     Parameters
     ----------
-    temperature_K : (n_points,)
+    time_s, temperature_K : (n_points,)
+        The two points of every step, step after step.
     on_K, off_K
         Thresholds.
-    width_K
-        Distance beyond a threshold at which the first point there counts as wholly switched.
     remembered : (n_points,)
         Share of full power that the memory stands for; its first is in force until a threshold is passed.
+    rate_K_per_s
+        How fast the temperature came to the first point.
     """
     beyond = np.where(temperature_K < on_K, 1, np.where(temperature_K > off_K, -1, 0))
     latest = np.maximum.accumulate(np.where(beyond != 0, np.arange(beyond.size), -1))
     called = np.where(latest >= 0, beyond[latest], 0)
     before = np.concatenate([[0], called[:-1]])
-    known = before != 0
-    old = np.where(known, before == 1, remembered[0])
-    distance = np.where(called == 1, on_K - temperature_K, temperature_K - off_K)
-    switched = np.where(called != before, np.clip(distance / width_K, 0.0, 1.0), 1.0)
-    switched = np.where(called == 0, 0.0, switched)
+    old = np.where(before != 0, before == 1, remembered[0])
     new = (called == 1).astype(np.float64)
-    moving = (called != before) & (switched < 1.0) & (switched > 0.0)
-    slope = np.where(moving, (new - old) / width_K, 0.0)
-    return Switching(
-        old + (new - old) * switched,
-        np.where((called == 0) | (np.arange(called.size) == 0), 1.0 - switched, 0.0),
-        np.where(called == 1, slope, 0.0),
-        np.where(called == -1, -slope, 0.0),
-        called,
-    )
+    changed = called != before
+    interval = _interval_s(time_s)
+    weight = interval / interval[np.minimum(np.arange(interval.size) ^ 1, interval.size - 1)]
+    travel = np.maximum(np.abs(np.diff(temperature_K, prepend=temperature_K[:1])), LEAST_TRAVEL_K)
+    travel[:1] = np.maximum(rate_K_per_s * interval[:1], LEAST_TRAVEL_K)
+    distance = np.where(called == 1, on_K - temperature_K, temperature_K - off_K)
+    passed = np.clip(distance / travel, 0.0, 1.0)
+    switched = np.where(changed, weight * passed, np.where(called == 0, 0.0, 1.0))
+    share = old + (new - old) * switched
+    slope = np.where(changed & (passed > 0.0) & (passed < 1.0), (new - old) * weight / travel, 0.0)
+    first = np.arange(0, called.size - 1, 2)
+    first = first[changed[first] & ~changed[first + 1]]
+    share[first + 1] += (new - old)[first] * (weight[first + 1] - 1.0)
+    from_memory = np.where((called == 0) | (np.arange(called.size) == 0), 1.0 - switched, 0.0)
+    return Switching(share, from_memory, np.where(called == 1, slope, 0.0), np.where(called == -1, -slope, 0.0), called)
+
+
+def _interval_s(time_s: FloatArray) -> FloatArray:
+    """Return how long it is to each point from the one before; the first step is cut as the second."""
+    if time_s.size < 3:
+        return np.ones(time_s.size)
+    return np.maximum(np.diff(time_s, prepend=time_s[0] - (time_s[2] - time_s[1])), 1e-9)
 
 
 @dataclass(frozen=True)
@@ -104,8 +126,9 @@ class Memory:
 
     def share(self, state_K: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the share of full power that a state stands for, and its slope in 1/K."""
-        share = (state_K - self.off_K) / (self.on_K - self.off_K)
-        return np.clip(share, 0.0, 1.0), np.where((share > 0.0) & (share < 1.0), 1.0 / (self.on_K - self.off_K), 0.0)
+        slope = (1.0 + UNSETTLED) / (self.on_K - self.off_K)
+        share = slope * (state_K - self.off_K) - 0.5 * UNSETTLED
+        return np.clip(share, 0.0, 1.0), np.where((share > 0.0) & (share < 1.0), slope, 0.0)
 
     def rate_K_per_s(self, state_K: FloatArray, called: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return how fast it follows, and the slope of that in 1/s; the first point is what it remembers."""
@@ -126,7 +149,7 @@ class ThermostatHeat:
 
     node: int
     state: int
-    width_K: float
+    rate_K_per_s: float
     memory: Memory
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
@@ -136,7 +159,8 @@ class ThermostatHeat:
         power, on_K, off_K = values
         state = along.temperatures_K[:, self.state]
         remembered, slope = self.memory.share(state)
-        relay = switching(along.temperatures_K[:, self.node], on_K, off_K, self.width_K, remembered)
+        temperature = along.temperatures_K[:, self.node]
+        relay = switching(along.time_s, temperature, on_K, off_K, remembered, self.rate_K_per_s)
         rate, decay = self.memory.rate_K_per_s(state, relay.called)
         by_node, by_state = -power * (relay.by_on + relay.by_off), power * relay.by_memory * slope
         jacobian = np.stack([np.stack([by_node, by_state], -1), np.stack([np.zeros_like(decay), decay], -1)], axis=-2)
@@ -165,8 +189,8 @@ class ThermostatHeater(Effect):
         """Return power and both thresholds."""
         return (
             Quality("Q_W", "W", null=0.0, positive=True),
-            Quality("T_on_K", "K", prior_std=10.0),
-            Quality("T_off_K", "K", prior_std=10.0),
+            Quality("T_on_K", "K", prior_std=10.0, leap=LEAP_K),
+            Quality("T_off_K", "K", prior_std=10.0, leap=LEAP_K),
         )
 
     @property
@@ -182,7 +206,7 @@ class ThermostatHeater(Effect):
         """Return heater and memory."""
         node, state = layout.node(self.where["node"]), layout.node(self._state)
         memory = Memory(*(float(self.settings[key]) for key in ("off_state_K", "on_state_K", "delay_s")))
-        return Addition((ThermostatHeat(node, state, float(self.settings["width_K"]), memory, self.parameters()),))
+        return Addition((ThermostatHeat(node, state, float(self.settings["rate_K_per_s"]), memory, self.parameters()),))
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:
@@ -194,12 +218,12 @@ class ThermostatHeater(Effect):
         """Yield pairs of thresholds among the quantiles of the visited temperatures."""
         temperature = survey.temperature_K(where["node"])
         lows, highs = np.quantile(temperature, ON_QUANTILES), np.quantile(temperature, OFF_QUANTILES)
-        width = max(LEAST_WIDTH_K, float(np.quantile(np.abs(np.diff(temperature)), WIDTH_QUANTILE)))
-        steps = np.diff(survey.along.time_s)
+        steps, moved = np.diff(survey.along.time_s), np.abs(np.diff(temperature))
+        rate = float(np.quantile(moved[steps > 0] / steps[steps > 0], RATE_QUANTILE))
         delay = DELAY_SHARE * 2.0 * float(np.median(steps[steps > 0]))
         for low, high in product(lows.tolist(), highs.tolist()):
             if high - low > LEAST_BAND_K:
-                settings = {"off_state_K": low, "on_state_K": high, "width_K": width, "delay_s": delay}
+                settings = {"off_state_K": low, "on_state_K": high, "rate_K_per_s": rate, "delay_s": delay}
                 yield cls(where, {"Q_W": 0.0, "T_on_K": low, "T_off_K": high}, settings)
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:

@@ -22,7 +22,7 @@ def rolled(time_s: np.ndarray, wall_K: np.ndarray, start_K: float) -> np.ndarray
     spec = conductive_spec(1, [], boundaries={"wall": {"channel": "W"}}, channels=channel)
     spec["conductors"] = [{"between": ["n0", "wall"], "conductance_W_per_K": {"guess": 1.0}}]
     dt_s = float(time_s[1])
-    settings = {"off_state_K": ON_K, "on_state_K": OFF_K, "width_K": 8e-3 * dt_s, "delay_s": 2e-3 * dt_s}
+    settings = {"off_state_K": ON_K, "on_state_K": OFF_K, "rate_K_per_s": 8e-3, "delay_s": 2e-3 * dt_s}
     values = {"Q_W": POWER_W, "T_on_K": ON_K, "T_off_K": OFF_K}
     heater = REGISTRY["thermostat_heater"]({"node": "n0"}, values, settings)
     network = at_named(build_network(load_spec(spec), [heater]), {"C:n0": C, "G:n0|wall": G})
@@ -93,11 +93,16 @@ def test_it_remembers_wherever_a_rollout_is_cut() -> None:
 
 
 def test_between_its_thresholds_it_does_what_it_did() -> None:
-    temperature = np.array([282.0, 283.0, 279.0, 283.0, 285.0, 283.0, 281.0, 279.9])
-    relay = switching(temperature, ON_K, OFF_K, 0.2, np.full(8, 0.25))
-    np.testing.assert_allclose(relay.share, [0.25, 0.25, 1.0, 1.0, 0.0, 0.0, 0.0, 0.5])
-    np.testing.assert_array_equal(relay.called, [0, 0, 1, 1, -1, -1, -1, 1])
-    np.testing.assert_allclose(relay.by_on, [0, 0, 0, 0, 0, 0, 0, 5.0])
+    """Steps of 10 s whose points stand at 3 s, for 7 s of heat, and at 10 s, for 3 s: each step gets its heat."""
+    time_s = np.array([3.0, 10.0, 13.0, 20.0, 23.0, 30.0, 33.0, 40.0, 43.0, 50.0])
+    temperature = np.array([282.0, 283.0, 281.0, 279.0, 281.0, 285.0, 283.0, 281.0, 279.0, 279.5])
+    relay = switching(time_s, temperature, ON_K, OFF_K, np.full(10, 0.25), 0.1)
+    np.testing.assert_array_equal(relay.called, [0, 0, 0, 1, 1, -1, -1, -1, 1, 1])
+    heated_s = 7.0 * relay.share[0::2] + 3.0 * relay.share[1::2]
+    # On after half of 13 s to 20 s, with a quarter of full power before; off after three quarters of 23 s to 30 s;
+    # which 3 s had gone; on after half of 40 s to 43 s.
+    np.testing.assert_allclose(heated_s, [2.5, 3.5 + 6.5 * 0.25, 3.0 + 0.75 * 7.0, 0.0, 1.5 + 7.0])
+    np.testing.assert_allclose(relay.by_on[8], 3.0 / 7.0 / 2.0)
 
 
 def test_thresholds_that_are_tried_stand_in_order_within_what_was_visited() -> None:
