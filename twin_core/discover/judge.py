@@ -9,7 +9,9 @@ from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
 from twin_core.effects.base import Effect
 
-N_VALIDATED = 3
+N_VALIDATED, N_VALIDATED_FREE = 3, 8
+"""Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
+
 ALTERNATIVE_NATS = 3.0
 VALIDATION_GAIN = 0.97
 """An effect must lower the error on blocks that it was not fitted to by 3 % at least, or it is not worth its name."""
@@ -85,17 +87,19 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     """Keep the best option that passes evidence and validation; False if none does."""
     judged = simplest_first(once_each(options))
     failed: list[Judged] = []
-    for best in judged[:N_VALIDATED]:
+    is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
+    for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
         own = replace(best, validation=validate(state.trial, best.trial))
         if (
             own.validation is not None
-            and is_valid(own.validation, len(own.effects))
+            and is_valid(own.validation, own.effects)
             and is_told(own)
             and _is_sound(state.trial, own, needed)
         ):
-            close = [j for j in judged if j is not best and j not in failed and is_close(j, best)]
+            elsewhere = [j for j in judged if _places(j) != _places(best) and j not in failed]
+            close = [j for j in elsewhere if is_close(j, best)]
             state.trial = best.trial
             state.findings.append(Finding(own, tuple(close)))
             return True
@@ -114,11 +118,15 @@ def _is_sound(simple: Trial, judged: Judged, needed: float) -> bool:
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:
-    """Return the options, best first, every set of effects and places once."""
-    best: dict[frozenset[object], Judged] = {}
+    """Return the options, best first, every set of effects, places and numbers of amplitudes once."""
+    best: dict[object, Judged] = {}
     for judged in sorted(options, key=worth):
-        best.setdefault(frozenset(effect.place for effect in judged.effects), judged)
+        best.setdefault(frozenset((effect.place, len(effect.amplitudes)) for effect in judged.effects), judged)
     return list(best.values())
+
+
+def _places(judged: Judged) -> frozenset[object]:
+    return frozenset(effect.place for effect in judged.effects)
 
 
 def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
@@ -139,17 +147,18 @@ def is_told(judged: Judged) -> bool:
     return all(judged.trial.free_std.get(name, 0.0) < UNTOLD_STD for name in shapes)
 
 
-def is_valid(validation: Validation, n_effects: int = 1) -> bool:
+def is_valid(validation: Validation, effects: Sequence[Effect]) -> bool:
     """Return whether effects help where they were not fitted, by an amount that a lumped network can judge.
 
-    Several at once have more ways to please one measure alone, so they must please both.
+    Several at once, or a free form, have more ways to please one measure alone, so they must please both.
     """
     blocks, forward = validation.ratio, validation.forward_ratio
     both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
     either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
-    share = EXPLAINED_SHARE if n_effects == 1 else EXPLAINED_SHARE_TOGETHER
+    is_single = len(effects) == 1
+    share = EXPLAINED_SHARE if is_single else EXPLAINED_SHARE_TOGETHER
     matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > share
-    return (both or (either and n_effects == 1)) and matters
+    return (both or (either and is_single and not effects[0].fallback)) and matters
 
 
 def worth(judged: Judged) -> float:

@@ -16,6 +16,9 @@ from twin_core.effects.base import Effect
 
 MAX_FINDINGS = 4
 N_REFITS = 12
+N_FREE_PLACES = 2
+"""Places at the head of each ranking at which a heat without a name is tried in all its forms."""
+
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
 N_SETTLED = 4
@@ -67,7 +70,12 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
-    singles = [(effect,) for effect in refined(state.trial.fit, shortlist(rankings, needed, N_REFITS))]
+    if fallback:
+        some = {probe.effect.place for ranked in rankings for probe in ranked[:N_FREE_PLACES] if probe.gain > needed}
+        chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
+    else:
+        chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS))
+    singles = [(effect,) for effect in chosen]
     if accept(state, _by_heat(state, singles, n_tried), needed):
         return True
     pairs = [] if fallback else _best_pairs(rankings[0], screenings[0], needed)

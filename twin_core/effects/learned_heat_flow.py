@@ -15,7 +15,8 @@ from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
 
-MAX_DEGREE = 3
+MAX_DEGREE, MAX_DEGREE_WITH_BOUNDARY = 6, 3
+"""Of the polynomials that are tried: of one temperature enough for a heat that rises and falls, of two as many terms."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class LearnedHeatFlow(Effect):
             boundary = survey.along.boundaries_K[:, survey.layout.boundary(where["boundary"])]
             forms = [False, True] if np.ptp(boundary) > 2.0 * SMALLEST_SCALE_K else []
         for vanishing in forms:
-            for degree in range(1, MAX_DEGREE + 1):
+            for degree in range(1, (MAX_DEGREE if boundary is None else MAX_DEGREE_WITH_BOUNDARY) + 1):
                 basis = Basis.over(degree, temperature, boundary, vanishing=vanishing)
                 none = np.zeros(len(basis.exponents))
                 settings, values = ForcePolynomial(basis, none, np.zeros((0, 0))).effect_settings()
