@@ -235,6 +235,8 @@ class ThermostatHeater(Effect):
         for s in survey.segments():
             temperatures = survey.along.temperatures_K[s]
             start = np.full((temperatures.shape[0], 1), temperatures[0, survey.layout.node(self.where["node"])])
-            along = replace(survey.along, temperatures_K=np.hstack([temperatures, start]))
+            along = replace(
+                survey.along, time_s=survey.along.time_s[s], temperatures_K=np.hstack([temperatures, start])
+            )
             share[s] = term.evaluate(along, values).heat_W[:, 0]
         return [[(survey.layout.node(self.where["node"]), share)]]
