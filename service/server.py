@@ -1,6 +1,7 @@
 """The running server: the application behind uvicorn, shut down without losing what was acknowledged."""
 
 import contextlib
+import os
 import socket
 import sys
 from collections.abc import Callable
@@ -64,6 +65,7 @@ def serve(
         config, on_ready, lambda: app.state.service.hub.close(), f"http://{f'[{host}]' if ':' in host else host}:{port}"
     )
     sys.setswitchinterval(SWITCH_S)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for workers: small matrices gain nothing from more, the service loses
     with contextlib.suppress(KeyboardInterrupt), listener:  # raised again once everything is closed in good order
         server.run(sockets=[listener])
 

@@ -25,6 +25,8 @@ T = TypeVar("T")
 
 END_GRACE_S = 2.0
 POLL_S = 0.2
+NICENESS = 15
+"""How far a job stands back: ingest and the live state go first."""
 
 
 class JobFailed(Exception):
@@ -155,7 +157,7 @@ def _end_with_parent() -> None:
 def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
     """Do the task: the whole life of a worker process."""
     prepare_worker()
-    os.nice(10)  # ingest and the live state go first
+    os.nice(NICENESS)
     module, _, qualified = name.partition(":")
     function: Any = importlib.import_module(module)
     for part in qualified.split("."):

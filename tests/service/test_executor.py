@@ -1,0 +1,39 @@
+"""Worker processes: they stand back behind the service."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.jobs.executor import NICENESS, ProcessPerTask
+from tests.service.conftest import SPEC
+from tests.service.server import FAKE, Server
+
+
+def niceness(*, progress: Callable[[float, str], None]) -> int:
+    """Return the niceness that a task finds."""
+    return os.nice(0)
+
+
+def test_a_job_has_a_low_priority() -> None:
+    with ProcessPerTask(1, 60.0) as executor:
+        assert executor.submit(niceness).result() == min(os.nice(0) + NICENESS, 19)
+
+
+@pytest.mark.e2e
+@pytest.mark.parametrize(("setting", "threads"), [(None, b"1"), ("2", b"2")])
+def test_a_worker_computes_in_one_thread_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, setting: str | None, threads: bytes
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if setting is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", setting)
+    with Server(tmp_path, FAKE) as server, server.client() as client:
+        client.register(SPEC)
+        model = {"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0}
+        assert httpx.post(f"{server.url}/v1/twins/benchsat/models", json=model, timeout=60).status_code == 201
+        workers = Path(f"/proc/{server.process.pid}/task/{server.process.pid}/children").read_text().split()
+        settings = [Path(f"/proc/{worker}/environ").read_bytes().split(b"\0") for worker in workers]
+    assert settings and all(b"OMP_NUM_THREADS=" + threads in setting for setting in settings)
