@@ -35,6 +35,8 @@ def send(server: Server, first: int, count: int = 200) -> None:
 def test_a_day_at_the_console(server: Server, page: Browser) -> None:
     page.until("!document.getElementById('empty').hidden")
     assert "curl" in page.text("#empty-code")
+    assert page.evaluate("document.querySelector('.picker').hidden")
+    assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.getElementById('empty-code'))")
 
     server.client().register(SPEC)
     page.until("document.getElementById('twin').value === 'benchsat'")
@@ -43,12 +45,15 @@ def test_a_day_at_the_console(server: Server, page: Browser) -> None:
     page.until("document.querySelector('#temperatures canvas')")
     assert "200" in page.text("#facts")
     assert "calibrate" in page.text("#residuals")
+    assert "No model" in page.text("#anomalies")  # nobody may say that a sensor behaves before one is active
+    assert page.evaluate("document.querySelectorAll('#now .state.unknown').length") == 2
 
     page.click("#calibrate")
     page.until("document.getElementById('models').innerText.includes('active')")
     page.until("document.querySelector('#residuals canvas')")
     page.until("document.getElementById('now-note').innerText.includes('expected in')")
     page.until("document.getElementById('anomalies').innerText.includes('T_px')")
+    assert page.evaluate("document.querySelectorAll('#now .state.unknown').length") == 0
     assert "17.05" in page.text("#now")  # 290.2 K, shown in the unit of the other sensor
     assert page.evaluate("document.querySelectorAll('#network circle.node').length") == 1
 
@@ -87,18 +92,33 @@ def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
     page.until("document.getElementById('plot-note').innerText.startsWith('61 samples')")
     page.drag("#temperatures .u-over", 0.2, 0.6)
     page.until("!document.querySelector('#ranges [aria-pressed=true]')")
+    page.press("1")
+    page.until("document.getElementById('plot-note').innerText.startsWith('61 samples')")
+    page.press("ArrowLeft")  # half an hour back
+    page.until("!document.querySelector('#ranges [aria-pressed=true]')")
+    page.until("document.getElementById('plot-note').innerText.startsWith('61 samples')")
+    page.press("+")
+    page.until("document.getElementById('plot-note').innerText.startsWith('31 samples')")
+    page.press("-")
+    page.until("document.getElementById('plot-note').innerText.startsWith('61 samples')")
     page.press("5")
     page.until("document.getElementById('plot-note').innerText.startsWith('200 samples')")
     page.press("?")
     page.until("document.getElementById('help-dialog').open")
     page.click("#help-dialog button")
     page.until("!document.getElementById('help-dialog').open")
+    page.click("#calibrate")
+    page.until("document.getElementById('models').innerText.includes('active')")
+    page.click("#diagnose")
+    page.until("document.getElementById('models').innerText.includes('constant heat load')")
     page.click("#legend button")
     assert page.evaluate("document.querySelector('#legend button').getAttribute('aria-pressed')") == "false"
 
     for width in (360, 820, 1400):
         page.resize(width, 900)
         page.until(f"document.documentElement.scrollWidth <= {width}")
+        fits = "(e => e.parentElement.scrollWidth <= e.parentElement.clientWidth)(document.getElementById('{}'))"
+        page.until(" && ".join(fits.format(table) for table in ("now", "models")))
     assert page.troubles == []
 
 

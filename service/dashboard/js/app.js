@@ -129,10 +129,10 @@ function drawFacts() {
 }
 
 function renderPlots() {
-  const list = sensors(), unit = unitShown(), from = units();
+  const list = sensors(), unit = unitShown(), from = units(), hasModel = state.detail.active_model !== null;
   $("unit").textContent = unitName(unit);
   renderLegend(list);
-  drawAnomalies($("anomalies"), state.anomalies, list, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
+  drawAnomalies($("anomalies"), state.anomalies, list, hasModel, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
   const open = state.anomalies.filter((a) => a.stop === null).length;
   $("anomaly-note").textContent = open ? `${open} open` : "";
   if (!state.archive || !state.detail.last_time) {
@@ -142,7 +142,7 @@ function renderPlots() {
     renderTemperatures(list, unit, from);
     renderResiduals(list);
   }
-  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies });
+  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, hasModel });
   $("now-note").textContent = state.ahead ? `${unitName(unit)}, expected in ${span(seconds(state.ahead.time.at(-1)) - seconds(state.ahead.from))}` : unitName(unit);
   renderNetwork(unit, from);
 }
@@ -242,6 +242,14 @@ zoomTo = (ends) => {
   refresh("plots");
 };
 
+// Moves the time shown by a share of its length, or makes it longer or shorter around its middle.
+function move(by, scale = 1) {
+  const shown = state.detail.last_time && window_s();
+  if (!shown) return;
+  const length = shown.stop - shown.start, middle = (shown.start + shown.stop) / 2 + by * length, half = Math.max(length * scale, 60) / 2;
+  zoomTo([middle - half, middle + half]);
+}
+
 function drawRanges() {
   $("ranges").replaceChildren(...RANGES.map(([label, length]) => make("button", {
     "aria-pressed": String(!state.zoom && state.range_s === length),
@@ -295,7 +303,7 @@ async function findTwins() {
   const { twins } = await call("v1/twins");
   const names = twins.map((t) => t.id);
   $("empty").hidden = names.length > 0;
-  $("main").hidden = names.length === 0;
+  $("main").hidden = $("picker").hidden = names.length === 0;
   if ([...$("twin").options].map((o) => o.value).join() !== names.join()) {
     $("twin").replaceChildren(...names.map((name) => make("option", { value: name }, name)));
     if (state.twin) $("twin").value = state.twin;
@@ -321,7 +329,8 @@ function switchUnit() {
 }
 
 const KEYS = [
-  ["1–5", "time range: an hour to everything"], ["0", "follow the present again"], ["c", "calibrate"], ["d", "diagnose"],
+  ["1–5", "time range: an hour to everything"], ["0", "follow the present again"],
+  ["← →", "earlier, later"], ["+ −", "closer, wider"], ["c", "calibrate"], ["d", "diagnose"],
   ["n", "residual or NIS"], ["u", "kelvin or degrees Celsius"], ["t", "light or dark"], ["j / k", "next or previous twin"], ["?", "these keys"],
 ];
 
@@ -330,6 +339,7 @@ function pressed(event) {
   const acts = {
     c: () => $("calibrate").click(), d: () => $("diagnose").click(), t: switchTheme, u: switchUnit, j: () => step(1), k: () => step(-1),
     n: () => { state.kind = state.kind === "nis" ? "residual" : "nis"; drawKinds(); renderPlots(); },
+    ArrowLeft: () => move(-0.5), ArrowRight: () => move(0.5), "+": () => move(0, 0.5), "-": () => move(0, 2),
     0: () => zoomTo(null), "?": () => $("help-dialog").showModal(),
   };
   RANGES.forEach(([, length], i) => { acts[i + 1] = () => { state.range_s = length; zoomTo(null); }; });

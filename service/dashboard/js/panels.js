@@ -3,10 +3,12 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies }) {
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, hasModel }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
   const show = (value, from) => number(toUnit(value, from, unit), 2);
-  const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
+  const look = (name) => (!hasModel ? ["state unknown", "no model is active"] : open.has(name) ? ["state bad", "anomaly"] : ["state", "as expected"]);
+  const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
+  const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {
     const { name } = sensor, from = units[name], next = ahead ? ahead[name] : null;
     return make("tr", {},
@@ -14,7 +16,7 @@ export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies 
       make("td", { class: "num big" }, latest[name] === undefined ? "–" : show(latest[name], from)),
       make("td", { class: "num" }, next ? show(next.mean.at(-1), from) : "–"),
       make("td", { class: "num sub" }, next ? `${show(Math.min(...next.q05), from)} … ${show(Math.max(...next.q95), from)}` : ""),
-      make("td", {}, make("span", { class: open.has(name) ? "state bad" : "state", role: "img", "aria-label": open.has(name) ? "anomaly" : "as expected", title: open.has(name) ? "anomaly" : "as expected" })));
+      make("td", {}, light(look(name))));
   });
   table.replaceChildren(make("thead", {}, head), make("tbody", {}, ...rows));
   return unitName(unit);
@@ -25,8 +27,8 @@ const KINDS = {
   joint: "together depart from the model",
 };
 
-export function drawAnomalies(list, anomalies, sensors, onPick) {
-  if (!anomalies.length) return list.replaceChildren(quiet("Every sensor behaves as its model says."));
+export function drawAnomalies(list, anomalies, sensors, hasModel, onPick) {
+  if (!anomalies.length) return list.replaceChildren(quiet(hasModel ? "Every sensor behaves as its model says." : "No model is active yet to compare the sensors with."));
   list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
     const index = sensors.findIndex((s) => s.name === anomaly.sensor);
     const open = anomaly.stop === null, start = seconds(anomaly.start);
