@@ -29,6 +29,9 @@ from twin_core.calibrate.starting import filled_columns
 LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 """Prior deviations of logarithmic parameters in the first passes, while the latent heat is still too large."""
 
+LARGEST_STEP = 1.5
+"""Longest move of a logarithmic parameter in one pass: a factor of e^1.5."""
+
 START_SHARES = (1.0, 0.03)
 """Sizes of the latent heat that a fit starts from, as shares of a typical one."""
 
@@ -79,7 +82,7 @@ def gauss_newton_step(
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]
         gradient -= flat[:, :-1].T @ flat[:, -1]
-    return bounded_step(_solved, hessian, gradient, *problem.step_bounds(free)), hessian
+    return bounded_step(_solved, hessian, gradient, *problem.step_bounds(free, LARGEST_STEP)), hessian
 
 
 def _solved(hessian: FloatArray, gradient: FloatArray) -> FloatArray:
@@ -189,8 +192,6 @@ def _improve(
     before = posterior(free, latent, nominals)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
         step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
-    logarithmic = problem.logarithmic
-    step *= min(1.0, 1.5 / max(np.abs(step[logarithmic]).max(initial=0.0), 1e-12))
     for _ in range(5):
         trial = free + step
         values = parameters.to_values(trial)

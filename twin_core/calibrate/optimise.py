@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
-from twin_core._typing import FloatArray, IntArray
+from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
 from twin_core.calibrate.problem import Fit, Problem
 
@@ -59,12 +59,6 @@ def _step(hessian: FloatArray, gradient: FloatArray, damping: float) -> FloatArr
     return step
 
 
-def _limited(step: FloatArray, logarithmic: IntArray) -> FloatArray:
-    """Return the step shortened as a whole where a logarithmic parameter would leap."""
-    longest = np.abs(step[logarithmic]).max(initial=0.0)
-    return step * min(1.0, LARGEST_STEP / longest) if longest > 0 else step
-
-
 def minimise(
     problem: Problem,
     unknowns: FloatArray | None = None,
@@ -102,11 +96,11 @@ def minimise(
     hessian, gradient = problem.normal_equations(x, fit)
     iterations = 0
     while iterations < max_iterations:
-        newton = bounded_step(partial(_step, damping=damping), hessian, gradient, *problem.step_bounds(x))
-        step = _limited(newton, problem.logarithmic)
+        step = bounded_step(partial(_step, damping=damping), hessian, gradient, *problem.step_bounds(x, LARGEST_STEP))
         predicted = -(gradient @ step + 0.5 * step @ hessian @ step)
         trial = problem.solve(x + step, fit)
-        gain = (fit.cost - trial.cost) / max(float(predicted), 1e-300) if np.isfinite(trial.cost) else -1.0
+        fell = fit.cost - trial.cost
+        gain = fell / max(abs(float(predicted)), 1e-300) if np.isfinite(trial.cost) else -1.0
         if gain > 1e-4:
             fall = (fit.cost - trial.cost) / max(fit.cost, 1e-300)
             x, fit, iterations = x + step, trial, iterations + 1
@@ -115,7 +109,7 @@ def minimise(
             if fall < tolerance:
                 status = "converged"
                 break
-        elif predicted <= tolerance * fit.cost:
+        elif 0.0 <= predicted <= tolerance * fit.cost:
             status = "converged"
             break
         else:

@@ -154,11 +154,16 @@ class Problem:
         free = [self.network.parameters.parameters[i] for i in self.network.parameters.free_index]
         return np.array([k for k, p in enumerate(free) if is_logarithmic(p.transform)], dtype=np.int64)
 
-    def step_bounds(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far down and up one step may go from a vector of unknowns or free parameters, of its size each."""
+    def step_bounds(self, unknowns: FloatArray, longest_log: float = np.inf) -> tuple[FloatArray, FloatArray]:
+        """Return how far down and up one step may go from a vector of unknowns or free parameters, of its size each.
+
+        Logarithmic parameters move by ``longest_log`` at most, each held back on its own: one that has lost its way to
+        nothing asks for a leap of many orders of magnitude, and a step shortened as a whole would move nothing at all.
+        """
         parameters = self.network.parameters
         leap = np.full(unknowns.size, np.inf)
         leap[: self.n_free] = parameters.leap
+        leap[self.logarithmic] = np.minimum(leap[self.logarithmic], longest_log)
         lowest = -leap
         lowest[: self.n_free] = np.maximum(lowest[: self.n_free], parameters.lowest - unknowns[: self.n_free])
         return np.minimum(lowest, 0.0), leap
