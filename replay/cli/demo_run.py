@@ -196,5 +196,7 @@ def print_outcome(outcome: Outcome, out: Path) -> None:
     print_table("residual of the declared model, calibrated", ["sensor", "noise K", "one step K", "open loop K"], rows)
     print_report(outcome.report)
     hidden = "nothing" if outcome.hidden is None else describe(outcome.hidden | {"parameters": {}})
-    print_line(f"hidden by the simulator: {hidden}; found: {outcome.found}")
+    others = len(outcome.report["findings"]) - (outcome.found in ("named", "alternative"))
+    beside = f", beside {others} finding{'s' if others > 1 else ''} that it did not hide" if others else ""
+    print_line(f"hidden by the simulator: {hidden}; found: {outcome.found}{beside}")
     print_line(f"wrote {out}/report.html, report.json, {RECORDING} in {outcome.elapsed_s:.0f} s")

@@ -114,6 +114,17 @@ def best_rejected(search: Search) -> list[Judged]:
     return list(once.values())
 
 
+def _doubts(search: Search, scores: Sequence[Json]) -> list[str]:
+    """Return what the hold-out says against the findings: it chose nothing, so it may."""
+    before_K, after_K = (score["rmse_K"] for score in scores)
+    if not search.findings or after_K < before_K:
+        return []
+    return [
+        f"held-out error: {before_K:.3g} K before, {after_K:.3g} K after; it did not fall, so trust the findings only "
+        "where the hold-out is known to differ from the training record"
+    ]
+
+
 def build_report(
     search: Search,
     before: CalibratedModel,
@@ -166,5 +177,9 @@ def build_report(
             for judged in best_rejected(search)[:8]
         ],
         "words": after.summary["words"],
-        "notices": [*before.summary["notices"], *(notice for p in predictions[1] for notice in p.notices)],
+        "notices": [
+            *_doubts(search, scores),
+            *before.summary["notices"],
+            *(notice for p in predictions[1] for notice in p.notices),
+        ],
     }

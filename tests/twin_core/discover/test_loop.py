@@ -1,7 +1,7 @@
 """The closed loop on spacecraft that SciPy simulated: it finds what is missing, and nothing where nothing is."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.network_cases import Case, network_case
 from twin_core.discover import close_loop
+from twin_core.discover.holdout import predict, split_burn_in
 from twin_core.discover.loop import ClosedLoop
 from twin_core.effects import REGISTRY
 from twin_core.errors import Cancelled, TelemetryError
@@ -227,3 +228,18 @@ def test_an_impossible_false_alarm_rate_is_refused(rate: float) -> None:
 def test_no_telemetry_is_refused() -> None:
     with pytest.raises(TelemetryError, match="no telemetry given"):
         close_loop(tiny().spec, [])
+
+
+def test_a_held_out_error_that_does_not_fall_is_said() -> None:
+    run = solved("radiation_to_sink")
+    held = split_burn_in(run.case.record, None)
+    readings = predict(
+        run.loop.before_model, held
+    )  # the declared model's own: as if somebody had mended the spacecraft
+    sensors = dict(zip(run.case.spec.sensors, readings.predicted_K.T, strict=True))
+    record = run.case.record.take(np.arange(run.case.record.time_s.size) >= held.lead.time_s.size)
+    mended = replace(record, values={**record.values, **sensors})
+    report = close_loop(run.case.spec, [run.case.record], holdout_records=[mended]).report
+    assert report["findings"] and report["after"]["rmse_K"] > report["before"]["rmse_K"]
+    assert "did not fall" in report["notices"][0]
+    assert not any("did not fall" in notice for notice in run.report["notices"])
