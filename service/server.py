@@ -65,9 +65,8 @@ def serve(
         config, on_ready, lambda: app.state.service.hub.close(), f"http://{f'[{host}]' if ':' in host else host}:{port}"
     )
     sys.setswitchinterval(SWITCH_S)
-    os.environ.setdefault(
-        "OMP_NUM_THREADS", "1"
-    )  # for workers: small matrices gain nothing from more, the service loses
+    # Workers inherit it: their matrices are small and gain nothing from more threads, while the service would wait.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     with contextlib.suppress(KeyboardInterrupt), listener:  # raised again once everything is closed in good order
         server.run(sockets=[listener])
 
