@@ -250,7 +250,9 @@ def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--spacecraft", type=int, default=12, help="how many spacecraft")
-    parser.add_argument("--first", type=int, default=300, help="seed of the first one; 0 to 5 were seen while it was tuned")
+    parser.add_argument(
+        "--first", type=int, default=300, help="seed of the first one; 0 to 5 were seen while it was tuned"
+    )
     totals = {name: Score() for name in DETECTORS}
     by_fault: dict[str, dict[str, Score]] = {}
     options = parser.parse_args()

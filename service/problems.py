@@ -85,12 +85,21 @@ async def _on_http(request: Request, error: Exception) -> Response:
     return problem(error.status_code, str(detail), headers=error.headers)
 
 
-async def _on_validation(_: Request, error: Exception) -> Response:
+async def _on_validation(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
+    media = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if not _is_json(media) and any(
+        item["loc"] == ("body",) and isinstance(item["input"], bytes) for item in error.errors()
+    ):
+        return problem(415, f"content-type must be application/json, got '{media[:60]}'")
     if any(item["type"] == "json_invalid" for item in error.errors()):
         return problem(400, "body: not valid JSON", [("body", "not valid JSON")])
     errors = [(_field(item["loc"]), item["msg"].removeprefix("Value error, ")) for item in error.errors()]
     return problem(422, "; ".join(f"{field}: {reason}" for field, reason in errors[:3]), errors)
+
+
+def _is_json(media: str) -> bool:
+    return media == "application/json" or media.endswith("+json")
 
 
 def _field(location: Sequence[str | int]) -> str:

@@ -130,6 +130,17 @@ ELSEWHERE = [
     Case("spec: endless nesting", "[" * 100_000, 400, "body", path="/v1/twins"),
     Case("spec: nesting that is well-formed", '{"a":' * 20_000 + "1" + "}" * 20_000, 400, "body", path="/v1/twins"),
     Case("spec: a list", [], 422, "body", path="/v1/twins"),
+    Case(
+        "spec: sent as a form",
+        spec_with(),
+        415,
+        "application/json",
+        path="/v1/twins",
+        kind="application/x-www-form-urlencoded",
+    ),
+    Case(
+        "forecast: sent as text", {"horizon_s": 9}, 415, "json", path="/v1/twins/benchsat/forecasts", kind="text/plain"
+    ),
     Case("spec: no nodes", spec_with(nodes=[]), 422, "nodes", path="/v1/twins"),
     Case("spec: bad id", spec_with(twin="Other Twin"), 422, "twin", path="/v1/twins"),
     Case("spec: unknown field", spec_with(colour="red"), 422, "colour", path="/v1/twins"),
