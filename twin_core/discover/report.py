@@ -36,6 +36,8 @@ def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
         else:
             rows[base] = {"mean": mean, "std": std}
     for name in effect.reported_settings:
+        if name not in effect.settings:
+            continue
         value = effect.settings[name]
         rows[name] = {"mean": list(value) if isinstance(value, tuple) else value, "std": None}
     return rows

@@ -4,13 +4,13 @@ The linearised response of the sensors to every candidate is propagated at once 
 whitened in the metric of sensor noise and latent heat, and projected off what the calibrated parameters can mimic.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
-from twin_core._typing import FloatArray, IntArray
+from twin_core._typing import FloatArray
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
@@ -19,7 +19,9 @@ from twin_core.network.terms import Along
 from twin_core.simulate.kernels import GAMMA, march_sensitivities
 from twin_core.simulate.rollout import balance_along
 
-COLUMNS_AT_ONCE = 256
+COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 1.6e7
+"""Responses held at once: so many columns, and so many numbers (130 MB): a long record is gone through in portions."""
+
 UNSEEN_SHARE = 1e-4
 """A candidate whose response is this close to what the nuisance parameters can mimic is not told by the data."""
 
@@ -30,25 +32,24 @@ class Probe:
 
     Attributes
     ----------
+    start
+        The candidate as it came, at its null amplitude.
     effect
         At the amplitude that explains most.
     gain
         Log-likelihood that it could add, in nats, at fixed noise.
-    response : (n_rows, n_amplitudes)
-        Whitened response projected off the nuisance parameters.
     """
 
+    start: Effect
     effect: Effect
     gain: float
-    response: FloatArray
 
 
 @dataclass(frozen=True)
 class Screening:
-    """All probes of one calibration, best first, and the projected residual that they were held against."""
+    """All probes of one calibration, best first, and how many candidates there were."""
 
     probes: tuple[Probe, ...]
-    residual: FloatArray
     n_tried: int
 
 
@@ -130,31 +131,27 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
         balance = balance_along(network, fit.values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
         n = stages.shape[2]
         jacobian = balance.jacobian_per_s.reshape(-1, 2, n, n)
-        parts = []
-        for first in range(0, len(columns), COLUMNS_AT_ONCE):
-            some = columns[first : first + COLUMNS_AT_ONCE]
-            rows = [
-                (column, node, series[window] / balance.capacity_J_per_K[:, node])
-                for column, (heat, _) in enumerate(some)
-                for node, series in heat
-            ]
-            block, _ = march_sensitivities(
-                forcing.step_s,
-                jacobian,
-                np.array([r[0] for r in rows], dtype=np.int64),
-                np.array([r[1] for r in rows], dtype=np.int64),
-                np.array([r[2] for r in rows]).reshape(len(rows), forcing.n_steps, 2),
-                np.zeros((n, len(some))),
-                forcing.sample_step,
-                network.sensor_node,
-                GAMMA,
-            )
-            at = np.maximum(2 * forcing.sample_step - 1, 0)
-            for column, (_, readings) in enumerate(some):
-                for sensor, series in readings:
-                    block[:, sensor, column] += series[window][at]
-            parts.append(block)
-        blocks.append(np.concatenate(parts, axis=2))
+        rows = [
+            (column, node, series[window] / balance.capacity_J_per_K[:, node])
+            for column, (heat, _) in enumerate(columns)
+            for node, series in heat
+        ]
+        block, _ = march_sensitivities(
+            forcing.step_s,
+            jacobian,
+            np.array([r[0] for r in rows], dtype=np.int64),
+            np.array([r[1] for r in rows], dtype=np.int64),
+            np.array([r[2] for r in rows]).reshape(len(rows), forcing.n_steps, 2),
+            np.zeros((n, len(columns))),
+            forcing.sample_step,
+            network.sensor_node,
+            GAMMA,
+        )
+        at = np.maximum(2 * forcing.sample_step - 1, 0)
+        for column, (_, readings) in enumerate(columns):
+            for sensor, series in readings:
+                block[:, sensor, column] += series[window][at]
+        blocks.append(block)
     return blocks
 
 
@@ -217,40 +214,61 @@ def screen_sizes(
 
     The responses are the same for all; only their metric changes.
     """
-    effects = list(candidates)
-    columns: list[Column] = []
-    owners = []
-    for i, effect in enumerate(effects):
-        for column in zip(effect.unit_heats(survey), effect.unit_readings(survey), strict=True):
-            columns.append(column)
-            owners.append(i)
     nuisance = [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals]
-    blocks = responses(fit, survey, columns) if columns else []
     sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
-    return [_screening(one, nuisance, effects, np.array(owners, dtype=np.int64), blocks) for one in sized]
+    grounds = [(one, *_nuisance(one, nuisance)) for one in sized]
+    probes: list[list[Probe]] = [[] for _ in shares]
+    n_tried = 0
+    for effects, edges, blocks in _portions(fit, survey, candidates):
+        n_tried += len(effects)
+        for found, (one, basis, residual) in zip(probes, grounds, strict=True):
+            whitened, projected = _projected(one, basis, blocks)
+            for effect, (a, b) in zip(effects, pairwise(edges), strict=True):
+                probe = _probe(effect, whitened[:, a:b], projected[:, a:b], residual)
+                found += [] if probe is None else [probe]
+    return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
 
 
-def _screening(
-    fit: HeatFit,
-    nuisance: Sequence[FloatArray],
-    effects: Sequence[Effect],
-    owners: IntArray,
-    blocks: Sequence[FloatArray],
-) -> Screening:
-    """Return the probes in the metric of a fit; ``owners`` tells which effect a column of the responses belongs to."""
-    basis, residual = _nuisance(fit, nuisance)
-    if not blocks:
-        return Screening((), residual, 0)
+def projected_responses(fit: HeatFit, survey: Survey, effects: Sequence[Effect]) -> tuple[list[FloatArray], FloatArray]:
+    """Return the whitened responses to a few effects, projected off the nuisance parameters, and the residual likewise.
+
+    Returns
+    -------
+    list of (n_rows, n_amplitudes), (n_rows,)
+    """
+    basis, residual = nuisance_basis(fit)
+    found: list[FloatArray] = []
+    for _, edges, blocks in _portions(fit, survey, effects):
+        _, projected = _projected(fit, basis, blocks)
+        found += [projected[:, a:b] for a, b in pairwise(edges)]
+    return found, residual
+
+
+def _portions(
+    fit: HeatFit, survey: Survey, effects: Iterable[Effect]
+) -> Iterator[tuple[list[Effect], list[int], list[FloatArray]]]:
+    """Yield effects, where the columns of each begin and end, and the responses, as many as fit into memory at once."""
+    limit = min(COLUMNS_AT_ONCE, VALUES_AT_ONCE / sum(n.segment.measured_K.size for n in fit.nominals))
+    some: list[Effect] = []
+    columns: list[Column] = []
+    edges = [0]
+    for effect in effects:
+        own = list(zip(effect.unit_heats(survey), effect.unit_readings(survey), strict=True))
+        if some and len(columns) + len(own) > limit:
+            yield some, edges, responses(fit, survey, columns)
+            some, columns, edges = [], [], [0]
+        some.append(effect)
+        columns += own
+        edges.append(len(columns))
+    if some:
+        yield some, edges, responses(fit, survey, columns)
+
+
+def _projected(fit: HeatFit, basis: FloatArray, blocks: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return responses in the metric of a fit, (n_rows, n_columns), as they are and projected off a basis."""
     whitened = _whitened(fit, blocks)
-    whitened = np.vstack([whitened, np.zeros((residual.size - whitened.shape[0], whitened.shape[1]))])
-    projected = whitened - basis @ (basis.T @ whitened)
-    edges = np.searchsorted(owners, np.arange(len(effects) + 1))
-    probes = [
-        _probe(effect, whitened[:, a:b], projected[:, a:b], residual)
-        for effect, (a, b) in zip(effects, pairwise(edges.tolist()), strict=True)
-    ]
-    found = sorted((p for p in probes if p is not None), key=lambda p: -p.gain)
-    return Screening(tuple(found), residual, len(effects))
+    whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
+    return whitened, whitened - basis @ (basis.T @ whitened)
 
 
 def _probe(effect: Effect, whitened: FloatArray, projected: FloatArray, residual: FloatArray) -> Probe | None:
@@ -265,12 +283,12 @@ def _probe(effect: Effect, whitened: FloatArray, projected: FloatArray, residual
     along = left[:, seen].T @ residual
     amounts = right[seen].T @ (along / singular[seen]) / np.maximum(size, 1e-300)
     moved = effect.with_amplitudes(amounts)
-    return None if moved is None else Probe(moved, 0.5 * float(along @ along), projected)
+    return None if moved is None else Probe(effect, moved, 0.5 * float(along @ along))
 
 
-def joint_gain(first: Probe, second: Probe, residual: FloatArray) -> float:
-    """Return the log-likelihood that two probes could add together, in nats."""
-    both = np.hstack([first.response, second.response])
+def joint_gain(first: FloatArray, second: FloatArray, residual: FloatArray) -> float:
+    """Return the log-likelihood that two effects could add together, in nats, from their projected responses."""
+    both = np.hstack([first, second])
     left, singular, _ = np.linalg.svd(both / np.maximum(np.linalg.norm(both, axis=0), 1e-300), full_matrices=False)
     along = left[:, singular > np.sqrt(UNSEEN_SHARE)].T @ residual
     return 0.5 * float(along @ along)

@@ -4,12 +4,13 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import combinations
 
 from twin_core._typing import Progress
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, try_effects, weigh
 from twin_core.discover.judge import Finding, Judged, Search, accept, threshold, worth
-from twin_core.discover.screen import Probe, Screening, joint_gain
+from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
 from twin_core.effects.base import Effect
@@ -78,19 +79,19 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     singles = [(effect,) for effect in chosen]
     if accept(state, _by_heat(state, singles, n_tried), needed):
         return True
-    pairs = [] if fallback else _best_pairs(rankings[0], screenings[0], needed)
+    pairs = [] if fallback else _best_pairs(rankings[0], state.trial, needed)
     return accept(state, _by_heat(state, pairs, max(n_tried**2 // 2, 1)), needed)
 
 
-def _best_pairs(ranked: Sequence[Probe], screening: Screening, needed: float) -> list[tuple[Effect, ...]]:
+def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:
     """Return the pairs of probes that could add most together: more than either alone, and enough to be supported."""
     some = ranked[:N_PAIR_PROBES]
+    responses, residual = projected_responses(trial.fit, survey_of(trial.fit), [probe.start for probe in some])
     scored = []
-    for i, a in enumerate(some):
-        for b in some[i + 1 :]:
-            gain = joint_gain(a, b, screening.residual)
-            if gain > max(a.gain, b.gain) + needed:
-                scored.append((gain, (a.effect, b.effect)))
+    for (a, of_a), (b, of_b) in combinations(zip(some, responses, strict=True), 2):
+        gain = joint_gain(of_a, of_b, residual)
+        if gain > max(a.gain, b.gain) + needed:
+            scored.append((gain, (a.effect, b.effect)))
     scored.sort(key=lambda item: -item[0])
     return [pair for _, pair in scored[:N_PAIR_REFITS]]
 

@@ -201,7 +201,7 @@ class Effect(ABC):
     reference: ClassVar[str]
     words: ClassVar[str]
     reported_settings: ClassVar[tuple[str, ...]] = ()
-    """Settings that the report lists beside the parameters, such as knots."""
+    """Settings that the report lists beside the parameters where the effect has them, such as knots."""
     fallback: ClassVar[bool] = False
     """True for an effect that is tried only where no named one is supported."""
 

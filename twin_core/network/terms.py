@@ -4,13 +4,13 @@ Every term, declared or discovered, answers one question at many points at once:
 heat into the nodes that it touches together with exact derivatives. The time loop never calls a term; it sees arrays.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.parameters.parameter import Parameter
 
@@ -264,13 +264,45 @@ class TableLoad:
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
 
+    def basis(self, along: Along) -> FloatArray:
+        """Return how much each value counts at each point, (n_points, n_values)."""
+        return table_basis(along.inputs[self.channel], self.knots, self.levels)
+
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
         """Evaluate the table; it is linear in its values."""
-        basis = self.weight * table_basis(along.inputs[self.channel], self.knots, self.levels)
+        basis = self.weight * self.basis(along)
         if self.solar:
             basis = basis * along.sun_factor[:, None]
-        entries = [Entry(i, self.node, basis[:, i]) for i in range(len(self.knots))]
+        entries = [Entry(i, self.node, basis[:, i]) for i in range(len(self.parameters))]
         return Heat((self.node,), (basis @ values)[:, None], np.zeros((1, 1, 1)), entries)
+
+
+@dataclass(frozen=True)
+class SteeredTable(TableLoad):
+    """A table over one channel for each state of another: ``states`` tells the state that each knot belongs to.
+
+    The channel ``state`` rests at ``rests``; in a state without knots there is no heat.
+    """
+
+    states: tuple[float, ...] = ()
+    state: str = ""
+    rests: tuple[float, ...] = ()
+
+    def basis(self, along: Along) -> FloatArray:
+        """Return how much each value counts at each point, (n_points, n_values)."""
+        now, x = nearest(along.inputs[self.state], self.rests), along.inputs[self.channel]
+        basis = np.zeros((x.size, len(self.knots)))
+        for k, rest in enumerate(self.rests):
+            own, rows = np.flatnonzero(np.array(self.states) == rest), np.flatnonzero(now == k)
+            if own.size:
+                knots = tuple(self.knots[i] for i in own)
+                basis[np.ix_(rows, own)] = table_basis(x[rows], knots, self.levels)
+        return basis
+
+
+def nearest(x: FloatArray, places: Sequence[float]) -> IntArray:
+    """Return which place each point is nearest to, (n_points,)."""
+    return np.asarray(np.argmin(np.abs(x[:, None] - np.asarray(places, dtype=np.float64)), axis=1))
 
 
 def table_basis(x: FloatArray, knots: tuple[float, ...], levels: bool) -> FloatArray:
@@ -280,8 +312,7 @@ def table_basis(x: FloatArray, knots: tuple[float, ...], levels: bool) -> FloatA
     """
     points = np.asarray(knots, dtype=np.float64)
     if levels:
-        nearest = np.argmin(np.abs(x[:, None] - points), axis=1)
-        return (nearest[:, None] == np.arange(points.size)).astype(np.float64)
+        return (nearest(x, knots)[:, None] == np.arange(points.size)).astype(np.float64)
     basis = np.zeros((x.size, points.size))
     if points.size == 1:
         return np.ones_like(basis)

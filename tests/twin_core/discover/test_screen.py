@@ -1,6 +1,8 @@
 """Screening: the linear response of the sensors to every candidate against rollouts with a little of it in place."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +10,16 @@ import pytest
 from tests.helpers import every_term_network
 from twin_core.calibrate.latent_heat import HeatFit, LatentHeat, linearise
 from twin_core.calibrate.problem import Problem, build_problem
-from twin_core.discover.screen import nuisance_basis, responses, screen, survey_of
-from twin_core.effects import REGISTRY, Effect
+from twin_core.discover import screen as screening_module
+from twin_core.discover.screen import (
+    nuisance_basis,
+    projected_responses,
+    responses,
+    screen,
+    screen_sizes,
+    survey_of,
+)
+from twin_core.effects import REGISTRY, Effect, Survey
 from twin_core.network.model import build_network
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -143,11 +153,13 @@ def test_the_gain_is_that_of_least_squares() -> None:
     assert screening.n_tried == 4
     assert screening.probes[0].effect.where == {"channel": "Q_a"}
     assert screening.probes[0].effect.values["g"] == pytest.approx(1.3, abs=0.1)
-    for probe in screening.probes:
-        amount, *_ = np.linalg.lstsq(probe.response, residual, rcond=None)
-        left = residual - probe.response @ amount
+    found, same_residual = projected_responses(fit, survey, [probe.start for probe in screening.probes])
+    np.testing.assert_array_equal(same_residual, residual)
+    for probe, response in zip(screening.probes, found, strict=True):
+        amount, *_ = np.linalg.lstsq(response, residual, rcond=None)
+        left = residual - response @ amount
         assert probe.gain == pytest.approx(0.5 * float(residual @ residual - left @ left), rel=1e-6)
-        np.testing.assert_allclose(basis.T @ probe.response, 0.0, atol=1e-8 * np.abs(probe.response).max())
+        np.testing.assert_allclose(basis.T @ response, 0.0, atol=1e-8 * np.abs(response).max())
     gains = [probe.gain for probe in screening.probes]
     assert gains == sorted(gains, reverse=True)
 
@@ -155,3 +167,31 @@ def test_the_gain_is_that_of_least_squares() -> None:
 def test_nothing_to_screen_is_no_error() -> None:
     fit = fit_of(problem())
     assert screen(fit, survey_of(fit), []).probes == ()
+
+
+def test_a_long_record_is_screened_in_portions_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No more columns at once than fit into memory, but for an effect that has more of its own; nothing else changes."""
+    fit = fit_of(problem())
+    survey = survey_of(fit)
+    effects = [
+        e for kind in REGISTRY.values() for where in kind.places(survey.layout) for e in kind.starts(where, survey)
+    ]
+    at_once: list[int] = []
+
+    def counted(fit: HeatFit, survey: Survey, columns: Sequence[Any]) -> list[np.ndarray]:
+        at_once.append(len(columns))
+        return responses(fit, survey, columns)
+
+    monkeypatch.setattr(screening_module, "responses", counted)
+    whole = screen_sizes(fit, (1.0, 0.1), survey, effects)
+    n_rows = sum(n.segment.measured_K.size for n in fit.nominals)
+    at_once.clear()
+    monkeypatch.setattr(screening_module, "VALUES_AT_ONCE", 7.5 * n_rows)
+    parts = screen_sizes(fit, (1.0, 0.1), survey, iter(effects))
+    assert max(at_once) <= max(7, max(len(e.amplitudes) for e in effects)) and len(at_once) > len(effects) / 8
+    for one, other in zip(whole, parts, strict=True):
+        assert one.n_tried == other.n_tried == len(effects)
+        gains = {id(p.start): p.gain for p in other.probes}
+        assert len(gains) == len(one.probes)
+        for probe in one.probes:
+            assert gains[id(probe.start)] == pytest.approx(probe.gain, rel=1e-9, abs=1e-9)

@@ -99,6 +99,21 @@ def test_channel_heat_load_by_knots() -> None:
     np.testing.assert_allclose(found[:, 2], [0.0, 10.0, 4.0])  # held beyond the outer knots
 
 
+def test_channel_heat_load_by_levels_over_another_channel() -> None:
+    """Each state interpolates between its own knots, the one without any has no heat, and sunlight falls with distance."""
+    mode, pitch = np.array([0.0, 1.0, 1.0, 2.0, 2.4, 1.0]), np.array([60.0, 75.0, 100.0, 80.0, 30.0, 170.0])
+    sun = np.linspace(1.0, 1.05, 6)
+    knots, states = (60.0, 90.0, 120.0, 45.0, 135.0), (1.0, 1.0, 1.0, 2.0, 2.0)
+    settings = {"knots": knots, "states": states, "across": "pitch", "levels": (0.0, 1.0, 2.0), "solar": True}
+    values = {f"values_W[{i}]": v for i, v in enumerate((2.0, 8.0, 5.0, -9.0, 9.0))}
+    effect = REGISTRY["channel_heat_load"]({"node": "c", "channel": "mode"}, values, settings)
+    (term,) = effect.addition(every_term_network([effect]).layout).terms
+    along = Along(np.arange(6.0), np.full((6, 3), 290.0), np.full((6, 3), 280.0), {"mode": mode, "pitch": pitch}, sun)
+    found = term.evaluate(along, np.array(list(values.values())))
+    expected = np.array([0.0, 5.0, 7.0, -2.0, -9.0, 5.0]) * sun
+    np.testing.assert_allclose(found.heat_W[:, 0], expected, atol=1e-12)
+
+
 @pytest.mark.parametrize(("limit_W", "expected"), [(1e3, [0.0, 0.0, 60.0]), (45.0, [0.0, 0.0, 45.0])])
 def test_proportional_heater(limit_W: float, expected: list[float]) -> None:
     values = {"k_W_per_K": 3.0, "T_set_K": 290.0, "Q_W": limit_W}
@@ -226,8 +241,11 @@ def test_a_power_law_needs_several_levels() -> None:
 def test_a_table_rests_on_the_levels_of_its_channel() -> None:
     network = every_term_network()
     survey = survey_of(network, points(network, 30))
-    by_level = next(iter(REGISTRY["channel_heat_load"].starts({"node": "c", "channel": "mode"}, survey)))
+    by_level, over_pitch = REGISTRY["channel_heat_load"].starts({"node": "c", "channel": "mode"}, survey)
     assert by_level.settings == {"knots": (0.0, 1.0, 2.0), "levels": True}
+    most = float(np.bincount(survey.along.inputs["mode"].astype(int)).argmax())
+    assert (over_pitch.settings["across"], over_pitch.settings["solar"]) == ("pitch", True)
+    assert set(over_pitch.settings["states"]) == {0.0, 1.0, 2.0} - {most}
     by_knots = next(iter(REGISTRY["channel_heat_load"].starts({"node": "c", "channel": "pitch"}, survey)))
     knots = by_knots.settings["knots"]
     assert not by_knots.settings["levels"]
@@ -243,3 +261,16 @@ def test_a_heater_that_starts_fits_its_reach() -> None:
         assert moved is not None
         assert moved.values["Q_W"] == pytest.approx(2.0 * start.settings["reach_K"])
         assert math.isfinite(moved.values["T_set_K"])
+
+
+def test_a_state_has_knots_only_where_it_has_been_more_than_once() -> None:
+    """State 1 has been everywhere, state 2 at high pitch in one eighth of the record only."""
+    network = every_term_network()
+    along = points(network, 400)
+    mode = np.where(np.arange(400) < 150, 0.0, along.inputs["mode"])
+    before = np.arange(400) < 350
+    pitch = np.where((mode == 2.0) & before, np.minimum(along.inputs["pitch"], 60.0), along.inputs["pitch"])
+    survey = survey_of(network, replace(along, inputs={**along.inputs, "pitch": pitch, "mode": mode}))
+    _, start = REGISTRY["channel_heat_load"].starts({"node": "a", "channel": "mode"}, survey)
+    cells = list(zip(start.settings["states"], start.settings["knots"], strict=True))
+    assert cells == [(1.0, 45.0), (1.0, 90.0), (1.0, 135.0), (2.0, 45.0)]
