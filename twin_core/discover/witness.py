@@ -5,7 +5,7 @@ its fitted parameters and smooths whatever heat must have flowed into the nodes 
 (Kouw et al., CCTA 2024, eqs. 5-29). Where both tell the same, a finding does not hang on the search alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, floor_K2
 from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
+from twin_core.discover.followed import followed
 from twin_core.discover.judge import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
@@ -37,6 +38,8 @@ SMALLEST_SHARE = 0.02
 calibration sized to nothing elsewhere carries no force at all."""
 CORRELATED, ALIKE = 0.8, 0.5
 """Correlation from which, and rms difference (as a share of the effect's heat) up to which, both witnesses agree."""
+REPEATABLE = 0.5
+"""Share of a missing heat that must come back with something for it to be called repeatable."""
 BAND = 2.0
 """Standard deviations within which a difference is no disagreement, and below which a heat is not seen."""
 
@@ -59,6 +62,8 @@ class NodeHeat:
         The missing heat over temperature; None where the data do not support that it repeats with temperature.
     turnover_W
         Mean heat that passes through the node: half of all flows' magnitudes.
+    follows
+        What the missing heat comes back with -> share of its variance that this predicts, the largest first.
     """
 
     node: str
@@ -69,6 +74,7 @@ class NodeHeat:
     effect_W: FloatArray | None
     law: ForcePolynomial | None
     turnover_W: float
+    follows: Mapping[str, float]
 
     @property
     def band_W(self) -> float:
@@ -91,6 +97,13 @@ class NodeHeat:
         alike = apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
         return alike or (self.correlation or 0.0) >= CORRELATED
 
+    def _following(self) -> str:
+        """Return what the swings come back with, in words."""
+        what, share = next(iter(self.follows.items()), ("nothing", 0.0))
+        if share < REPEATABLE:
+            return f"which comes back with nothing declared (at best {share:.0%} of it with the {what})"
+        return f"of which {share:.0%} comes back with the {what}"
+
     def row(self) -> Json:
         """Return the figures for a report."""
         return {
@@ -104,13 +117,14 @@ class NodeHeat:
             else _rms(self.effect_W) / self.turnover_W,
             "correlation_with_effect": self.correlation,
             "agrees": self.agrees,
+            "follows": [{"what": what, "share": share} for what, share in self.follows.items()],
         }
 
     def words(self) -> str:
         """Return one sentence."""
         seen = (
             f"Independent latent force at {self.node}: the declared model lacks {self.mean_W.mean():.3g} W on average, "
-            f"swinging by {self.mean_W.std():.2g} W (band {self.band_W:.2g} W)"
+            f"swinging by {self.mean_W.std():.2g} W (band {self.band_W:.2g} W), {self._following()}"
         )
         if self.effect_W is None:
             return f"{seen}."
@@ -173,7 +187,9 @@ def bear_witness(search: Search) -> Witness:
             continue
         said = None if effect is None or np.isnan(effect[:, at]).any() else effect[:, at]
         time_s = view.forcing.stage_time_s[:, 1]
-        heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at])))
+        drivers = {f"temperature of {node}": states[:, at], **view.drivers(search.base.fit.network)}
+        follows = followed(time_s, mean, drivers)
+        heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
     return Witness(tuple(heats), tuple(notices))
 
 
@@ -209,6 +225,13 @@ class _View:
             sun_factor=forcing.sun_factor[first:],
         )
         return cls(window, first)
+
+    def drivers(self, network: Network) -> dict[str, FloatArray]:
+        """Return inputs, auxiliary channels and moving boundaries at the ends of the steps, by name, (n_steps,) each."""
+        ends = self.forcing.boundaries_K[:, 1]
+        moving = {f"temperature of {name}": ends[:, i] for i, name in enumerate(network.spec.boundaries)}
+        inputs = {f"channel {name}": series[:, 1] for name, series in self.forcing.inputs.items()}
+        return {name: column for name, column in (moving | inputs).items() if np.ptp(column) > 0.0}
 
     def turnover_W(self, network: Network, states_K: FloatArray) -> FloatArray:
         """Return the mean heat that passes through each node at the ends of the steps, (n_nodes,)."""

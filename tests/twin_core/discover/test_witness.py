@@ -108,7 +108,7 @@ def test_trouble_is_told_not_raised(search, monkeypatch, error):
 def _heat(effect_W, mean_W, std_W=0.5) -> NodeHeat:
     steps = np.arange(50.0)
     full = None if effect_W is None else effect_W * np.ones(50)
-    return NodeHeat("n", steps, 280.0 + steps, mean_W * np.ones(50), std_W * np.ones(50), full, None, 10.0)
+    return NodeHeat("n", steps, 280.0 + steps, mean_W * np.ones(50), std_W * np.ones(50), full, None, 10.0, {})
 
 
 WAVE = np.sin(np.arange(50.0) / 5.0)
