@@ -1,6 +1,7 @@
 """The calibrated model: numbers with their uncertainty, plain words about what the data cannot see, a JSON form."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NoReturn
 
 import numpy as np
@@ -59,6 +60,11 @@ class CalibratedModel:
 
     def network(self) -> Network:
         """Return the network at the calibrated values."""
+        return self._network
+
+    @cached_property
+    def _network(self) -> Network:
+        """Made once: live forecasts and assimilation ask for it with every step."""
         network = build_network(self.spec, self.effects, table_knots=self.table_knots)
         return network.with_parameters(network.parameters.updated(self.values))
 
