@@ -59,6 +59,15 @@ class Finding:
         """The effects, at the values of the trial that found them."""
         return self.judged.effects
 
+    def without(self, place: object, worth_of_it: float, trial: Trial) -> "Finding":
+        """Return the finding without its effect at a place, whose log Bayes factor was ``worth_of_it``, if it has one."""
+        kept = tuple(effect for effect in self.effects if effect.place != place)
+        if len(kept) == len(self.effects):
+            return self
+        rest = self.judged.evidence.log_bayes_factor - worth_of_it
+        evidence = replace(self.judged.evidence, log_bayes_factor=rest)
+        return replace(self, judged=replace(self.judged, effects=kept, evidence=evidence, trial=trial))
+
 
 @dataclass
 class Search:

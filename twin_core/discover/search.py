@@ -9,7 +9,7 @@ from itertools import combinations
 from twin_core._typing import Progress
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, try_effects, weigh
-from twin_core.discover.judge import Finding, Judged, Search, accept, threshold, worth
+from twin_core.discover.judge import Judged, Search, accept, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
@@ -50,7 +50,7 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
         if not _extend(state, needed, fallback=False):
             break
-        _prune(state, needed)
+        prune(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
@@ -114,16 +114,19 @@ def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int
     return Judged(found, weigh(state.trial, trial, n_tried), trial)
 
 
-def _prune(state: Search, needed: float) -> None:
-    """Drop findings that a later one has made superfluous."""
-    for finding in list(state.findings[:-1]):
-        kept = [f for f in state.findings if f is not finding]
-        without = try_effects(state.trial, [e for f in kept for e in _present(state, f)], n_passes=10)
-        if weigh(without, state.trial, 1).log_bayes_factor <= needed:
-            state.trial, state.findings = without, kept
+def prune(state: Search, needed: float) -> None:
+    """Drop findings, and members of a set that was found together, that the others have made superfluous."""
+    for finding in list(state.findings):
+        for effect in finding.effects if len(finding.effects) > 1 or finding is not state.findings[-1] else ():
+            _drop(state, effect.place, needed)
 
 
-def _present(state: Search, finding: Finding) -> list[Effect]:
-    """Return a finding's effects at their present values."""
-    places = {effect.place for effect in finding.effects}
-    return [effect for effect in state.trial.effects if effect.place in places]
+def _drop(state: Search, place: object, needed: float) -> None:
+    """Drop the effect at a place if the model without it is hardly less likely."""
+    without = try_effects(state.trial, [e for e in state.trial.effects if e.place != place], n_passes=10)
+    worth_of_it = weigh(without, state.trial, 1).log_bayes_factor
+    if worth_of_it > needed or not without.effects:
+        return
+    state.trial = without
+    state.findings = [f.without(place, worth_of_it, without) for f in state.findings]
+    state.findings = [f for f in state.findings if f.effects]

@@ -7,10 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover.confirm import Trial, try_effects, weigh
+from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
 from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
-from twin_core.discover.judge import threshold
+from twin_core.discover.judge import Finding, Judged, Search, threshold
 from twin_core.discover.screen import screen, survey_of
+from twin_core.discover.search import prune
+from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.input_gain import InputGain
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.spec import TwinSpec
@@ -90,3 +92,17 @@ def test_an_effect_that_rescales_its_node_leaves_the_declaration() -> None:
     assert at_guess.effects[0].values["g"] > 5.0  # drawn towards the guesses, though not by the readings
     assert leaves_declaration(at_guess, at_truth)
     assert not leaves_declaration(at_truth, at_guess)
+
+
+def test_a_member_that_the_others_make_superfluous_is_dropped_from_its_set() -> None:
+    base, single = named(heater)
+    pair = try_effects(single, [*single.effects, ConstantHeatLoad({"node": "a"}, {"Q_W": 0.0})], n_passes=15)
+    state = Search(pair, base, findings=[Finding(Judged(pair.effects, Evidence(50.0, 0.0), pair))])
+    prune(state, NEEDED)
+    (finding,) = state.findings
+    assert (
+        [effect.name for effect in finding.effects] == ["proportional_heater"] == [e.name for e in state.trial.effects]
+    )
+    worth = weigh(single, pair, 1).log_bayes_factor  # what the readings say for the load: that it is not there
+    assert worth < NEEDED
+    assert finding.judged.evidence.log_bayes_factor == pytest.approx(50.0 - worth, abs=0.5)
