@@ -5,6 +5,9 @@ from typing import Any
 
 import numpy as np
 
+Row = dict[str, Any]
+"""One case of the loop's suite, as its results file holds it."""
+
 Z90 = 1.6448536269514722
 
 

@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.bands import Row
 from benchmarks.loop_cases import GROUPS, N_CLEAN, N_NETWORKS, Task, suite
-from benchmarks.loop_table import Row, save_tables
+from benchmarks.loop_table import save_tables
 from benchmarks.network_cases import Case
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover import close_loop

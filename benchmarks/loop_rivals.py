@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.bands import Row
 from benchmarks.loop import HOLDOUT, place, run_all
 from benchmarks.loop_cases import Task, suite
-from benchmarks.loop_table import Row
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.network_cases import Case
 from benchmarks.rival_bic import greedy_bic

@@ -1,21 +1,27 @@
 """Tables of the closed loop over the suite: per effect, per group, and the targets with what was measured."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from benchmarks.bands import bands
+from benchmarks.bands import Row, bands
+from benchmarks.loop_plot import save_plot
 from benchmarks.markdown import markdown_table, save_table
-
-Row = dict[str, Any]
 
 
 def save_tables(rows: Sequence[Row]) -> None:
-    """Save ``benchmarks/tables/loop.md`` from the rows of a run."""
+    """Save ``benchmarks/tables/loop.md`` and its plot from the rows of a run."""
     failed = [row for row in rows if "error" in row]
     good = [row for row in rows if "error" not in row]
-    parts = ["## Targets", targets(good), "## By effect", by_effect(good), "## Worst cases", worst(good)]
+    parts = [
+        "## Targets",
+        targets(good),
+        save_plot(good),
+        "## By effect",
+        by_effect(good),
+        "## Worst cases",
+        worst(good),
+    ]
     note = "".join(f"\nFailed: {row['task']}: {row['error']}" for row in failed)
     save_table("loop", "Closed loop over seeded spacecraft", "\n\n".join(parts), "benchmarks.loop", note)
 
