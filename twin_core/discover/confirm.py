@@ -8,12 +8,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import chi2
 
-from twin_core._typing import FloatArray
+from twin_core._typing import BoolArray, FloatArray
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
-from twin_core.calibrate.problem import Problem
+from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, gls_covariance
 from twin_core.effects.base import Effect
@@ -23,7 +23,13 @@ N_BLOCKS = 8
 """Blocks of the training record that are predicted from the others."""
 
 FORWARD_SHARE = 0.35
-BURN_IN_SHARE = 0.1
+"""End of a single segment that is predicted from its beginning."""
+
+OPENING_SHARE = 0.1
+"""First samples of a segment, which tell its initial state, and are left out by no check."""
+
+MOST_FOLDS = 4
+"""Groups of segments that are left out in turn."""
 
 CONSIDERABLE = 0.1
 """Nodes whose latent heat moves them less than this share of the most moved one say nothing about an effect."""
@@ -82,7 +88,7 @@ class Trial:
 
     @cached_property
     def forward_error(self) -> float:
-        """Sum of squared weighted errors over the end of the training record, predicted by a fit to its beginning."""
+        """Sum of squared weighted errors over parts of the training record that a refit has not seen."""
         return forward_error(self.calibration)
 
     @cached_property
@@ -143,10 +149,11 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         problem.step_bounds(unknowns)[1]
     )  # an instant is told by one block alone, and seldom moves linearly
     jacobian, hessian = jacobian[:, :, told], hessian[np.ix_(told, told)]
+    later = np.concatenate([~_opening(segment) for segment in problem.segments])
     edges = np.linspace(0, residual.shape[0], N_BLOCKS + 1).astype(int)
     errors = np.zeros(N_BLOCKS)
     for b, (first, last) in enumerate(pairwise(edges.tolist())):
-        valid = np.isfinite(residual[first:last])
+        valid = np.isfinite(residual[first:last]) & later[first:last]
         rows, left = jacobian[first:last][valid], residual[first:last][valid]
         rest = hessian - rows.T @ rows
         scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
@@ -158,26 +165,42 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
 
 
 def forward_error(calibration: Calibration) -> float:
-    """Return the open-loop error over the last part of the training record, after a refit to what comes before.
+    """Return the open-loop error over what a refit has not seen; infinite where a refit fails.
 
-    Later segments keep their first samples, so that their initial state is known; infinite where the refit fails.
+    Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
+    Of a single one the end is predicted by a fit to the beginning.
     """
-    problem = calibration.problem
-    rows = np.cumsum([0] + [s.measured_K.shape[0] for s in problem.segments])
-    cut = int((1.0 - FORWARD_SHARE) * rows[-1])
-    early, late = [], []
-    for segment, first in zip(problem.segments, rows[:-1], strict=True):
-        n_rows = segment.measured_K.shape[0]
-        kept = max(cut - first, int(BURN_IN_SHARE * n_rows), 3)
-        at_end = np.arange(n_rows)[:, None] >= kept
-        early.append(replace(segment, measured_K=np.where(at_end, np.nan, segment.measured_K)))
-        late.append(np.where(at_end, segment.measured_K, np.nan))
-    shortened = replace(problem, segments=tuple(early))
-    optimum = minimise(shortened, calibration.optimum.unknowns, near=calibration.optimum.fit)
-    if optimum.status == "no_solution":
-        return np.inf
-    errors = [(m - p) / problem.noise_K for m, p in zip(late, optimum.fit.predicted_K, strict=True)]
-    return float(sum(np.nansum(e**2) for e in errors))
+    problem, optimum = calibration.problem, calibration.optimum
+    error = 0.0
+    for fold in _folds(problem.segments):
+        kept = tuple(
+            replace(segment, measured_K=np.where(out, np.nan, segment.measured_K))
+            for segment, out in zip(problem.segments, fold, strict=True)
+        )
+        refit = minimise(replace(problem, segments=kept), optimum.unknowns, near=optimum.fit)
+        if refit.status == "no_solution":
+            return np.inf
+        for segment, out, predicted_K in zip(problem.segments, fold, refit.fit.predicted_K, strict=True):
+            left = (segment.measured_K - predicted_K) / problem.noise_K
+            error += float(np.nansum(np.where(out, left, 0.0) ** 2))
+    return error
+
+
+def _folds(segments: Sequence[Segment]) -> list[list[BoolArray]]:
+    """Return what is left out in turn: per fold and segment which rows, (n_samples, 1)."""
+    if len(segments) == 1:
+        n_rows = segments[0].measured_K.shape[0]
+        return [[np.arange(n_rows)[:, None] >= int((1.0 - FORWARD_SHARE) * n_rows)]]
+    n_folds = min(len(segments), MOST_FOLDS)
+    return [
+        [~_opening(segment) & (i % n_folds == fold) for i, segment in enumerate(segments)] for fold in range(n_folds)
+    ]
+
+
+def _opening(segment: Segment) -> BoolArray:
+    """Return which rows of a segment tell its initial state, (n_samples, 1)."""
+    n_rows = segment.measured_K.shape[0]
+    return np.arange(n_rows)[:, None] < max(int(OPENING_SHARE * n_rows), 3)
 
 
 def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) -> Trial:
@@ -288,11 +311,14 @@ class Validation:
     blocks_better
         Share of blocks whose error fell.
     forward_ratio
-        The same for the end of the training record, after a refit to its beginning: does the effect extrapolate?
+        The same for the end of the training record after a refit to its beginning, or where there are several segments
+        for each after a refit to the others: does the effect extrapolate?
     removed_share
         Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
     explained_share
         Share of the latent heat's variance that the effect makes superfluous, on the node where it does so most.
+    n_sessions
+        Segments of the training record.
     """
 
     ratio: float
@@ -300,6 +326,7 @@ class Validation:
     forward_ratio: float
     removed_share: float
     explained_share: float
+    n_sessions: int = 1
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
@@ -327,7 +354,9 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     ratio = float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
     forward = float(np.sqrt(rich.forward_error / max(simple.forward_error, 1e-300)))
     better = float(np.mean(after < before))
-    return Validation(ratio, better, forward, _removed_share(simple, rich), explained_share(simple.fit, rich.fit))
+    explained = explained_share(simple.fit, rich.fit)
+    n_sessions = len(rich.fit.problem.segments)
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions)
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

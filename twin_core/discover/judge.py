@@ -23,6 +23,10 @@ DECISIVE, TOLERATED = 0.7, 1.7
 """Where one event tells all, either measure may see little of it: an effect that lowers the one by 30 % may raise the
 other by as much as an event that it has not seen costs."""
 
+BETWEEN_SESSIONS = 0.5
+"""Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to, or it is the sessions
+that differ."""
+
 LUMPING_SHARE = 0.005
 """What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
@@ -35,6 +39,9 @@ UNTOLD_STD = 1.0
 EXPLAINED_SHARE, EXPLAINED_SHARE_TOGETHER = 0.6, 0.85
 """An effect must make this much of the latent heat's variance superfluous where it acts, several at once almost all of it,
 or something else is missing there."""
+
+HALVED = 0.5
+"""Several at once that more than halve both measures are worth their names like one that is alone."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +166,17 @@ def is_told(judged: Judged) -> bool:
 def is_valid(validation: Validation, effects: Sequence[Effect]) -> bool:
     """Return whether effects help where they were not fitted, by an amount that a lumped network can judge.
 
-    Several at once, or a free form, have more ways to please one measure alone, so they must please both.
+    Several at once, or a free form, have more ways to please one measure alone, so they must please both. A law holds in
+    every session; an event does not.
     """
     blocks, forward = validation.ratio, validation.forward_ratio
     both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
     either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
+    if validation.n_sessions > 1 and all(q.instant is None for effect in effects for q in effect.qualities()):
+        both = blocks < VALIDATION_GAIN and 1.0 - forward > BETWEEN_SESSIONS * (1.0 - blocks)
+        either = False
     is_single = len(effects) == 1
-    share = EXPLAINED_SHARE if is_single else EXPLAINED_SHARE_TOGETHER
+    share = EXPLAINED_SHARE if is_single or max(blocks, forward) < HALVED else EXPLAINED_SHARE_TOGETHER
     matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > share
     return (both or (either and is_single and not effects[0].fallback)) and matters
 

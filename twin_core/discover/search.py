@@ -26,6 +26,9 @@ N_SETTLED = 4
 SETTLING_NATS = 40.0
 """Options this far behind after a few passes are not fitted further."""
 
+N_FIRST = 2
+"""Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
+
 
 def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Search:
     """Find the effects that a declared model lacks.
@@ -99,12 +102,13 @@ def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tu
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
     """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        quick = pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3), options)
+        quick = list(pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3), options))
         judged = sorted(quick, key=worth)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
+        near += [j for j in quick[:N_FIRST] if all(j is not n for n in near)]
         settled = pool.map(lambda j: _judge(state, j.trial, j.effects, n_tried, n_passes=15), near)
-        return [*settled, *judged[len(near) :]]
+        return [*settled, *(j for j in judged if all(j is not n for n in near))]
 
 
 def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:

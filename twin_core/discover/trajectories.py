@@ -1,7 +1,8 @@
 """The second look, at open-loop trajectories: where misfit is too large for the innovations to lead the way.
 
 Long trajectories forgive effects that merely resemble what is missing, so what they suggest must be supported by the
-innovations too: once, for one set of effects, not for one among many.
+innovations too: once, for one set of effects, not for one among many. Where the likeliest set does not hold, another one
+that the trajectories like less is no better a name.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from twin_core.discover.confirm import (
     weigh,
     weigh_trajectories,
 )
-from twin_core.discover.judge import N_VALIDATED, Judged, Search, accept, once_each, worth
+from twin_core.discover.judge import Judged, Search, accept, is_close, once_each
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 
 N_REFITS = 6
@@ -48,16 +49,18 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
     misfit = state.trial.misfit_share
     if misfit < LEAST_MISFIT_SHARE:
         return False
-    sets: list[Judged] = []
+    seeds = [state.trial]
     for n_together in range(1, 2 if fallback or misfit < TOGETHER_MISFIT_SHARE else MOST_TOGETHER + 1):
-        seeds = [j.trial for j in sets] if sets else [state.trial]
         judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
         sets = once_each(judged)[:N_KEPT]
-        state.rejected += sets
-        if accept(state, _supported(state, sets, needed), needed):
-            return True
         if not sets:
             break
+        state.rejected += sets
+        if accept(state, _supported(state, sets if fallback else sets[:1], needed), needed):
+            close = tuple(j for j in sets[1:] if is_close(j, sets[0]))
+            state.findings[-1] = replace(state.findings[-1], alternatives=close)
+            return True
+        seeds = [j.trial for j in sets]
     return False
 
 
@@ -80,6 +83,6 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
 
 def _supported(state: Search, options: Sequence[Judged], needed: float) -> list[Judged]:
     """Return the options that the innovations support as well, with their parameters fitted to these."""
-    likely = [j for j in sorted(options, key=worth)[:N_VALIDATED] if j.evidence.log_bayes_factor > needed]
+    likely = [j for j in options if j.evidence.log_bayes_factor > needed]
     settled = [replace(j, trial=resettled(state.trial, j.trial)) for j in likely]
     return [j for j in settled if weigh(state.trial, j.trial, 1).log_bayes_factor > needed]
