@@ -247,13 +247,16 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
 def resettled(simple: Trial, rich: Trial) -> Trial:
     """Return a trial that was fitted on trajectories with its parameters fitted in the presence of latent heat too.
 
-    Started from its own optimum and from the simpler trial's fit: the likelier one counts.
+    Started from its own optimum, about the measured temperatures and about its own trajectory (where the simpler model's
+    latent heat has taken over a node that nobody reads, only the latter is near), and from the simpler trial's fit: the
+    likeliest one counts.
     """
     calibration = rich.calibration
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
     own = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
+    along = fit_with_latent_heat(calibration.problem, free, near=rich.fit)
     near = try_effects(simple, rich.present_effects, n_passes=15).fit
-    fit = max(own, near, key=lambda f: f.log_posterior)
+    fit = max(own, along, near, key=lambda f: f.log_posterior)
     return replace(rich, fit=fit, near=(calibration.optimum,), simpler=None)
 
 
