@@ -257,7 +257,8 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     along = fit_with_latent_heat(calibration.problem, free, near=rich.fit)
     near = try_effects(simple, rich.present_effects, n_passes=15).fit
     fit = max(own, along, near, key=lambda f: f.log_posterior)
-    return replace(rich, fit=fit, near=(calibration.optimum,), simpler=None)
+    effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
+    return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None)
 
 
 def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:

@@ -8,12 +8,12 @@ from itertools import combinations
 
 from twin_core._typing import Progress
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
-from twin_core.discover.confirm import Trial, try_effects, weigh
-from twin_core.discover.judge import Judged, Search, accept, threshold, worth
+from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
+from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, touched_nodes
 
 MAX_FINDINGS = 4
 N_REFITS = 12
@@ -25,6 +25,9 @@ N_PAIR_REFITS = 5
 N_SETTLED = 4
 SETTLING_NATS = 40.0
 """Options this far behind after a few passes are not fitted further."""
+
+RIVAL_NATS = 20.0
+"""Forms this near the best one at its place are compared once more."""
 
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
@@ -106,9 +109,39 @@ def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int)
         judged = sorted(quick, key=worth)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
-        near += [j for j in quick[:N_FIRST] if all(j is not n for n in near)]
-        settled = pool.map(lambda j: _judge(state, j.trial, j.effects, n_tried, n_passes=15), near)
-        return [*settled, *(j for j in judged if all(j is not n for n in near))]
+        here = _acts_at(judged[0]) if judged else set()
+        rivals = [*quick[:N_FIRST], *(j for j in judged if _acts_at(j) == here)]  # other forms where the best one acts
+        near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
+        settled = list(pool.map(lambda j: _judge(state, j.trial, j.effects, n_tried, n_passes=15), near))
+        rest = [j for j in judged if all(j is not n for n in near)]
+        compared = pool.map(lambda j: _from_trajectories(state, j, n_tried), _forms_of_the_best(settled))
+        return once_each([*settled, *compared, *rest])
+
+
+def _forms_of_the_best(settled: Sequence[Judged]) -> list[Judged]:
+    """Return the best option with its rivals: no less simple, acting where it does, and near it; none if it has no rival.
+
+    These explain the same heat, so a fit that stopped early must not decide between them.
+    """
+    if not settled:
+        return []
+    best = min(settled, key=worth)
+    near = [j for j in settled if j.evidence.log_bayes_factor > best.evidence.log_bayes_factor - RIVAL_NATS]
+    simple = [j for j in near if j.trial.fit.problem.n_free <= best.trial.fit.problem.n_free]
+    rivals = [j for j in simple if _acts_at(j) == _acts_at(best)]
+    return rivals if len({j.trial.effects[-1].place for j in rivals}) > 1 else []
+
+
+def _from_trajectories(state: Search, judged: Judged, n_tried: int) -> Judged:
+    """Return an option fitted from its open-loop optimum too, at the likelier of both fits."""
+    trial = resettled(state.trial, judged.trial)
+    return Judged(trial.effects[len(state.trial.effects) :], weigh(state.trial, trial, n_tried), trial)
+
+
+def _acts_at(judged: Judged) -> set[str]:
+    """Return the nodes at which the effects of an option act."""
+    layout = judged.trial.fit.network.layout
+    return {node for effect in judged.effects for node in touched_nodes(effect, layout)}
 
 
 def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:
