@@ -7,6 +7,7 @@ import numpy as np
 
 from replay.clock import Clock, Pace
 from replay.errors import ReplayError
+from replay.missing import missing
 from replay.recording import Recording
 from service.client import ApiError, TwinClient, Unreachable
 
@@ -55,7 +56,7 @@ def play(
     batch
         Most samples per request.
     resume
-        Leave out what lies at or before the last instant that the service already holds.
+        Leave out the instants of which the service already holds every value.
     clock
         For tests.
     progress
@@ -67,16 +68,10 @@ def play(
         If the service refuses a request or stays out of reach.
     """
     try:
-        rest = recording.after(_last_ns(client, twin)) if resume else recording
+        rest = missing(recording, client, twin) if resume else recording
         return _send_all(rest, client, twin, Pace(rate, clock), _cuts(rest, rate, batch), progress)
     except (ApiError, Unreachable) as error:
         raise ReplayError(str(error)) from error
-
-
-def _last_ns(client: TwinClient, twin: str) -> int:
-    """Return the last instant that the service holds, before all instants if it holds none."""
-    last_time = client.twin(twin).last_time
-    return -1 if last_time is None else int(np.datetime64(last_time.removesuffix("Z"), "ns").astype(np.int64))
 
 
 def _send_all(
@@ -119,8 +114,8 @@ def _cuts(recording: Recording, rate: float | None, batch: int) -> Iterator[slic
 
 def _times(recording: Recording) -> list[str]:
     """Return RFC 3339 to the microsecond, rounded."""
-    micros = ((recording.time_ns + 500) // 1000).astype("datetime64[us]")
-    return [f"{text}Z" for text in np.datetime_as_string(micros, unit="us").tolist()]
+    texts = np.datetime_as_string(recording.time_us.astype("datetime64[us]"), unit="us")
+    return [f"{text}Z" for text in texts.tolist()]
 
 
 def _values(recording: Recording) -> dict[str, list[float | None]]:

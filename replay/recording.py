@@ -43,12 +43,14 @@ class Recording:
         """Return the number of instants."""
         return int(self.time_ns.size)
 
-    def after(self, instant_ns: int) -> "Recording":
-        """Return what was recorded after ``instant_ns``; it may be empty."""
-        return self.rows(slice(int(np.searchsorted(self.time_ns, instant_ns, side="right")), None))
+    @property
+    def time_us(self) -> NDArray[np.int64]:
+        """The axis in microseconds, rounded: what a service tells apart."""
+        rounded: NDArray[np.int64] = (self.time_ns + 500) // 1000
+        return rounded
 
-    def rows(self, selection: slice) -> "Recording":
-        """Return the instants of one slice."""
+    def rows(self, selection: slice | NDArray[np.bool_]) -> "Recording":
+        """Return some of the instants; there may be none."""
         columns = {name: column[selection] for name, column in self.columns.items()}
         return Recording(self.time_ns[selection], columns, self.units, self.metadata)
 

@@ -1,6 +1,8 @@
 """The player against a small service that keeps what it is sent."""
 
 import json
+from datetime import datetime
+from typing import Any
 
 import httpx
 import numpy as np
@@ -22,11 +24,24 @@ class Recorder:
         self.failures, self.left = failures, failures
         self.rows: dict[str, float | None] = {}
         self.sizes: list[int] = []
+        self.sent: list[str] = []
+        self.most = 10**9
+
+    def archive(self, start: str, stop: str, channels: str) -> dict[str, Any]:
+        """Thin out what is too much, as the service does."""
+        assert channels == "T_px"
+        inside = sorted(time for time in self.rows if instant(start) <= instant(time) < instant(stop))
+        thin = len(inside) > self.most
+        kept = inside[:: len(inside) - 1] if thin else inside
+        values = {"T_px": [self.rows[time] for time in kept]}
+        return {"time": kept, "values": values, "units": {}, "samples": len(inside), "downsampled": thin}
 
     def __call__(self, request: httpx.Request) -> httpx.Response:
-        last = max(self.rows, default=None)
+        first, last = min(self.rows, default=None), max(self.rows, default=None)
+        if request.url.path.endswith("/telemetry") and request.method == "GET":
+            return httpx.Response(200, json=self.archive(**dict(request.url.params)))
         if request.method == "GET":
-            head = {"id": "t", "created": "x", "samples": 0, "first_time": None, "last_time": last}
+            head = {"id": "t", "created": "x", "samples": 0, "first_time": first, "last_time": last}
             return httpx.Response(
                 200, json={**head, "active_model": None, "seq": 0, "channels": [], "specification": {}}
             )
@@ -36,9 +51,14 @@ class Recorder:
         self.left = self.failures
         body = json.loads(request.content)
         self.rows |= dict(zip(body["time"], body["values"]["T_px"], strict=True))
+        self.sent += body["time"]
         self.sizes.append(len(body["time"]))
         report = {"accepted": len(body["time"]), "duplicates": 0, "rejected": [], "last_time": max(self.rows)}
         return httpx.Response(200, json=report)
+
+
+def instant(text: str) -> datetime:
+    return datetime.fromisoformat(text)
 
 
 def make_client(recorder: Recorder, attempts: int = 3) -> TwinClient:
@@ -69,6 +89,30 @@ def test_resume_sends_only_what_is_missing() -> None:
         play(ramp(10), client, "t")
         assert play(ramp(15), client, "t", resume=True).sent == 5
         assert play(ramp(15), client, "t", resume=True).sent == 0
+
+
+@pytest.mark.parametrize("most", [10**9, 3])
+def test_resume_fills_gaps_and_brings_up_contradictions(most: int) -> None:
+    recorder = Recorder()
+    recorder.most = most
+    with make_client(recorder) as client:
+        play(ramp(30), client, "t")
+        whole, recorder.sent = dict(recorder.rows), []
+        times = list(whole)
+        for lost in (0, 7, 8, 20):  # what the service holds needs not be the first part
+            del recorder.rows[times[lost]]
+        recorder.rows[times[11]] = None  # the instant came with another channel
+        recorder.rows[times[13]] = 99.0
+        assert play(ramp(30), client, "t", resume=True).sent == 6
+    assert recorder.sent == [times[k] for k in (0, 7, 8, 11, 13, 20)]
+    assert recorder.rows == whole
+
+
+def test_resume_sends_what_is_older_than_all_that_the_service_holds() -> None:
+    recorder = Recorder()
+    with make_client(recorder) as client:
+        recorder.rows["2026-02-01T00:00:00Z"] = 1.0
+        assert play(ramp(10), client, "t", resume=True).sent == 10
 
 
 def test_a_paced_replay_takes_its_time_and_sends_small_batches() -> None:

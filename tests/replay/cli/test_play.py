@@ -54,6 +54,9 @@ def test_samples_arrive_once(url: str, tmp_path: Path, capsys: pytest.CaptureFix
     # Kelvin in the recording, degrees Celsius in the twin.
     np.testing.assert_allclose(archive.values["T_a"], 280.0 - 273.15 + np.arange(40) * 0.6)
     assert archive.values["Q_a"] == [5.0] * 40
+    earlier = record(tmp_path / "earlier.mcap", range(-20, 45))
+    code, outcome = run(capsys, url, earlier, "--resume")
+    assert code == 0 and (outcome["sent"], outcome["accepted"]) == (25, 25)
 
 
 def test_conflicts_are_the_answer_no(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
