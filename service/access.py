@@ -65,9 +65,6 @@ class Gate:
         if refusal is None:
             scope.setdefault("state", {})["role"] = role
             await self._app(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 1008, "reason": refusal[1]})
         else:
             status, detail = refusal
             extra = {"WWW-Authenticate": "Bearer"} if status == 401 else None

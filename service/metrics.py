@@ -1,10 +1,22 @@
 """Prometheus metrics of one application, in a registry of its own so that applications do not share numbers."""
 
 import time
+from collections.abc import Iterable
 from http import HTTPMethod
 
-from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client import (
+    CollectorRegistry,
+    Counter,
+    Gauge,
+    GCCollector,
+    Histogram,
+    PlatformCollector,
+    ProcessCollector,
+    generate_latest,
+)
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.store.watch import Vitals
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -38,6 +50,23 @@ class Metrics:
         self.jobs_running = Gauge("twin_jobs_running", "Jobs that run now.", registry=self.registry)
         self.assimilated = Counter("twin_assimilated_samples", "Samples that updated a state.", registry=self.registry)
         self.skipped = Counter("twin_skipped_samples", "Samples that no state could take.", registry=self.registry)
+        self.open_anomalies = Gauge(
+            "twin_open_anomalies", "Anomalies that last still.", ("twin",), registry=self.registry
+        )
+        self.last_sample_s = Gauge(
+            "twin_last_sample_timestamp_seconds", "Unix time of the last sample.", ("twin",), registry=self.registry
+        )
+        for collector in (ProcessCollector, PlatformCollector, GCCollector):
+            collector(registry=self.registry)
+
+    def show(self, vitals: Iterable[Vitals]) -> None:
+        """Show the twins as they are now, and no longer those that are gone."""
+        self.open_anomalies.clear()
+        self.last_sample_s.clear()
+        for twin in vitals:
+            self.open_anomalies.labels(twin.twin).set(twin.open_anomalies)
+            if twin.last_us is not None:
+                self.last_sample_s.labels(twin.twin).set(twin.last_us / 1e6)
 
     def render(self) -> bytes:
         """Return everything in the text format of Prometheus."""

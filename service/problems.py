@@ -2,14 +2,15 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from http import HTTPStatus
+from http import HTTPMethod, HTTPStatus
 from typing import Any
 
 import orjson
 from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi.exceptions import RequestValidationError, WebSocketRequestValidationError
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.routing import Match, Mount
 
 from service.store.gone import TwinGone
 from twin_core.errors import TwinError
@@ -63,6 +64,7 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(Problem, _on_problem)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(RequestValidationError, _on_validation)
+    app.add_exception_handler(WebSocketRequestValidationError, _on_socket_validation)
     app.add_exception_handler(TwinError, _on_twin_error)
     app.add_exception_handler(TwinGone, _on_gone)
     app.add_exception_handler(Exception, _on_crash)
@@ -81,8 +83,23 @@ async def _on_http(request: Request, error: Exception) -> Response:
     elif error.status_code == 400 and detail == _UNREADABLE:
         return problem(400, "body: not valid JSON", [("body", "not valid JSON")])
     elif error.status_code == 405:
-        detail = f"{request.method} is not possible here"
+        return problem(405, f"{request.method} is not possible here", headers={"Allow": _allowed(request)})
     return problem(error.status_code, str(detail), headers=error.headers)
+
+
+def _allowed(request: Request) -> str:
+    """Return the methods of every route on the request's path; the framework knows those of one route only."""
+    methods = {method.value for method in HTTPMethod if _takes(request, method)}
+    methods = methods or {"GET"}  # a mounted folder of files
+    if "GET" in methods:
+        methods.add("HEAD")
+    return ", ".join(sorted(methods))
+
+
+def _takes(request: Request, method: str) -> bool:
+    scope = {**request.scope, "method": method}
+    routes = (route for route in request.app.routes if not isinstance(route, Mount))
+    return any(route.matches(dict(scope))[0] is Match.FULL for route in routes)
 
 
 async def _on_validation(request: Request, error: Exception) -> Response:
@@ -94,7 +111,16 @@ async def _on_validation(request: Request, error: Exception) -> Response:
         return problem(415, f"content-type must be application/json, got '{media[:60]}'")
     if any(item["type"] == "json_invalid" for item in error.errors()):
         return problem(400, "body: not valid JSON", [("body", "not valid JSON")])
-    errors = [(_field(item["loc"]), item["msg"].removeprefix("Value error, ")) for item in error.errors()]
+    return _bad_fields(error.errors())
+
+
+async def _on_socket_validation(_: Request, error: Exception) -> Response:
+    assert isinstance(error, WebSocketRequestValidationError)
+    return _bad_fields(error.errors())
+
+
+def _bad_fields(items: Sequence[Any]) -> Response:
+    errors = [(_field(item["loc"]), item["msg"].removeprefix("Value error, ")) for item in items]
     return problem(422, "; ".join(f"{field}: {reason}" for field, reason in errors[:3]), errors)
 
 

@@ -5,11 +5,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Body, Path
 
 from service.deps import NamedTwin, Running, operates, reads
+from service.fit import refuse_foreign
 from service.jobs import outcome
-from service.problems import BadField
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
 from service.store import models
 from twin_core import __version__
+from twin_core.network.spec import load_spec
 
 router = APIRouter(prefix="/v1/twins/{twin}/models", tags=["models"])
 
@@ -46,8 +47,7 @@ async def activate(service: Running, twin: NamedTwin, version: Version) -> Model
 async def add(service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body()]) -> ModelInfo:
     """Store a model that the command line made for this twin as a new version, not active."""
     made = await service.live.inspect(body)
-    if made.document["spec"]["twin"] != twin.name:
-        raise BadField("spec.twin", f"is '{made.document['spec']['twin']}', must be '{twin.name}'")
+    refuse_foreign(load_spec(made.document["spec"]), twin)
     head = await service.database.read(models.first_us, twin.key)
     provenance = {"code_version": __version__, "settings": {}, "epoch_us": head, "data_sha256": None, "parent": None}
     row = await service.hub.write(twin.key, outcome.add_manual, twin.key, made, provenance)

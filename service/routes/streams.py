@@ -12,7 +12,7 @@ from starlette.responses import StreamingResponse
 from service.access import SUBPROTOCOL
 from service.deps import NamedTwin, Running, reads
 from service.messages import Json
-from service.problems import BadField, Problem
+from service.problems import BadField
 from service.registry import Entry
 from service.streams import Hub
 
@@ -50,17 +50,11 @@ def _event(message: Json) -> bytes:
 
 
 @router.websocket("/stream")
-async def stream(socket: WebSocket, twin: str, after_seq: AfterSeq = None) -> None:
+async def stream(socket: WebSocket, service: Running, twin: NamedTwin, after_seq: AfterSeq = None) -> None:
     """Stream the same messages, one JSON text each."""
-    service = socket.app.state.service
-    try:
-        entry = service.registry.get(twin)
-    except Problem as error:
-        await socket.close(1008, error.detail)
-        return
     offered = socket.scope.get("subprotocols", [])
     await socket.accept(subprotocol=next((p for p in offered if p.startswith(SUBPROTOCOL)), None))
-    sender = asyncio.create_task(_send(socket, service.hub, entry, after_seq))
+    sender = asyncio.create_task(_send(socket, service.hub, twin, after_seq))
     listener = asyncio.create_task(_listen(socket))
     await asyncio.wait([sender, listener], return_when=asyncio.FIRST_COMPLETED)
     for task in (sender, listener):

@@ -167,3 +167,18 @@ def test_wrong_request_is_refused_by_name(make_client, spec: dict, case: Case) -
     assert case.says in problem["detail"] or case.says in json.dumps(problem.get("errors", []))
     assert client.get(TELEMETRY).json()["samples"] == 1
     assert len(client.get("/v1/twins").json()["twins"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("PUT", "/v1/twins", "GET, HEAD, POST"),
+        ("PATCH", "/v1/twins/benchsat", "DELETE, GET, HEAD"),
+        ("DELETE", "/v1/twins/benchsat/telemetry", "GET, HEAD, POST"),
+        ("HEAD", "/v1/twins/benchsat/forecasts", "POST"),
+        ("POST", "/assets/style.css", "GET, HEAD"),
+    ],
+)
+def test_a_wrong_method_is_told_every_right_one(registered: AppClient, method: str, path: str, allowed: str) -> None:
+    response = registered.request(method, path)
+    assert (response.status_code, response.headers["allow"]) == (405, allowed)

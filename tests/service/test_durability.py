@@ -170,9 +170,16 @@ def _wait_until_group_is_gone(group: int) -> None:
     raise AssertionError("worker processes outlived the service")
 
 
-def test_second_server_on_one_database_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("link", [None, "symlink_to", "hardlink_to"])
+def test_second_server_on_one_database_is_refused(tmp_path: Path, link: str | None) -> None:
     with Server(tmp_path) as server:
-        environment = {**os.environ, "TWIN_PORT": "0", "TWIN_DATABASE_URL": f"sqlite:///{tmp_path / 'twin.sqlite3'}"}
+        path = tmp_path / "twin.sqlite3"
+        if link is not None:
+            (tmp_path / "elsewhere").mkdir()
+            other = tmp_path / "elsewhere" / "other.sqlite3"
+            getattr(other, link)(path)
+            path = other
+        environment = {**os.environ, "TWIN_PORT": "0", "TWIN_DATABASE_URL": f"sqlite:///{path}"}
         second = subprocess.run(
             [sys.executable, "-m", "service"], env=environment, capture_output=True, text=True, timeout=30, check=False
         )
@@ -180,6 +187,17 @@ def test_second_server_on_one_database_is_refused(tmp_path: Path) -> None:
         assert "another server uses this database" in second.stderr
         assert "Traceback" not in second.stderr
         assert server.client().is_ready()
+
+
+def test_a_second_store_in_one_process_is_refused_under_any_name(tmp_path: Path) -> None:
+    path, other = tmp_path / "twin.sqlite3", tmp_path / "other.sqlite3"
+    first = Database(path)
+    other.hardlink_to(path)
+    for name in (path, other):
+        with pytest.raises(StoreError, match="another server"):
+            Database(name)
+    first.close()
+    Database(path).close()
 
 
 def test_graceful_stop_finishes_what_it_acknowledged(tmp_path: Path) -> None:

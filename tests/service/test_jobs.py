@@ -1,6 +1,8 @@
 """Calibrations and diagnoses as jobs, and the model versions that they leave."""
 
+import copy
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -220,3 +222,34 @@ def test_a_model_made_elsewhere(client: AppClient) -> None:
     assert (response.json()["source"], response.json()["active"]) == ("manual", False)
     assert client.post(f"{TWIN}/models", json={"spec": {**SPEC, "twin": "other"}}).status_code == 422
     assert client.post(f"{TWIN}/models", json={}).status_code == 422
+
+
+FOREIGN: list[tuple[str, Any]] = [
+    ("spec.channels.T_tank.unit", lambda spec: spec["channels"]["T_tank"].update(unit="K")),
+    ("spec.channels.Q_px.unit", lambda spec: spec["channels"]["Q_px"].update(unit="percent")),
+    ("spec.channels.Q_new", lambda spec: spec["channels"].update(Q_new={"kind": "power", "unit": "W"})),
+    ("spec.channels", lambda spec: (spec["channels"].pop("Q_px"), spec["loads"].clear())),
+    ("spec.nodes[1].sensor", lambda spec: spec["nodes"][1].pop("sensor")),
+    ("spec.nodes[0].id", lambda spec: spec["nodes"].reverse()),
+    ("spec.nodes", lambda spec: spec["nodes"].append({"id": "inner"})),
+    ("spec.twin", lambda spec: spec.update(twin="other")),
+]
+
+
+@pytest.mark.parametrize(("field", "change"), FOREIGN, ids=[field for field, _ in FOREIGN])
+def test_a_model_of_other_channels_or_nodes_is_refused(
+    client: AppClient, field: str, change: Callable[[dict[str, Any]], Any]
+) -> None:
+    spec = copy.deepcopy(SPEC)
+    change(spec)
+    response = client.post(f"{TWIN}/models", json={"spec": spec, "rmse_K": 1.0, "max_step_s": 60.0})
+    assert response.status_code == 422, response.text
+    assert [error["field"] for error in response.json()["errors"]] == [field]
+    assert client.get(f"{TWIN}/models").json()["models"] == []
+
+
+def test_a_model_with_guesses_and_couplings_of_its_own_is_taken(client: AppClient) -> None:
+    spec = copy.deepcopy(SPEC)
+    spec["conductors"] = []
+    spec["nodes"][0]["capacity_J_per_K"] = {"guess": 1e5}
+    assert client.post(f"{TWIN}/models", json={"spec": spec, "max_step_s": 60.0}).status_code == 201

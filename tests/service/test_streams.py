@@ -141,12 +141,24 @@ def test_strangers_and_unknown_twins_are_refused(tmp_path: Path) -> None:
     with Server(tmp_path, api_keys="read:r,operate:o") as server:
         with server.client("o") as client:
             client.register(SPEC)
-        for url in (socket_url(server, "benchsat"), socket_url(server, "nosuch")):
-            with pytest.raises(InvalidStatus, match="403"):
-                connect(url)
+        key = {"Authorization": "Bearer r"}
+        for url, headers, status, field in (
+            (socket_url(server, "benchsat"), {}, 401, None),
+            (socket_url(server, "nosuch"), {}, 401, None),
+            (socket_url(server, "benchsat"), {"Authorization": "Bearer x"}, 401, None),
+            (socket_url(server, "nosuch"), key, 404, None),
+            (socket_url(server, "benchsat", "?after_seq=-1"), key, 422, "after_seq"),
+            (socket_url(server, "benchsat", "?after_seq=x"), key, 422, "after_seq"),
+        ):
+            with pytest.raises(InvalidStatus) as refused:
+                connect(url, additional_headers=headers)
+            response = refused.value.response
+            assert response.status_code == status
+            assert response.headers["content-type"] == "application/problem+json"
+            document = json.loads(response.body)
+            assert document["status"] == status and document["detail"]
+            assert [error["field"] for error in document.get("errors", [])] == ([field] if field else [])
         with connect(socket_url(server, "benchsat"), subprotocols=["bearer.r"]) as socket:
             assert socket.subprotocol == "bearer.r"
-        with connect(socket_url(server, "benchsat"), additional_headers={"Authorization": "Bearer r"}):
+        with connect(socket_url(server, "benchsat"), additional_headers=key):
             pass
-        with pytest.raises(InvalidStatus, match="403"):
-            connect(socket_url(server, "nosuch"), additional_headers={"Authorization": "Bearer r"})
