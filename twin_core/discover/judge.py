@@ -111,13 +111,9 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
-        own = replace(best, validation=validate(state.trial, best.trial))
-        if (
-            own.validation is not None
-            and is_valid(own.validation, own.effects)
-            and is_told(own)
-            and _is_sound(state.trial, own, needed)
-        ):
+        validation = validate(state.trial, best.trial)
+        own = replace(best, validation=validation)
+        if is_valid(validation, own.effects) and is_told(own) and _is_sound(state.trial, own, needed):
             elsewhere = [j for j in judged if _places(j) != _places(best) and j not in failed]
             close = [j for j in elsewhere if is_close(j, best)]
             state.trial = best.trial
