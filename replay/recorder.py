@@ -1,18 +1,23 @@
 """The recorder: follows the live stream of a twin and writes what arrives to an MCAP file."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from replay.errors import ReplayError
 from replay.mcap_writer import McapWriter
 from service.client import ApiError, AsyncTwinClient, Unreachable
-from service.schemas import Message, TwinDetail
+from service.schemas import Archive, Message, Residuals, TwinDetail
+
+Part = TypeVar("Part", Archive, Residuals)
 
 RESIDUAL = "residual_{}"
 """Topic of the innovations of one sensor, in kelvin; named so that a replay does not take it for the sensor."""
+NOT_FOLLOWED = 409
+"""How a service answers that follows no samples with its model: there are no innovations then."""
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.2, 10.0
 
 
@@ -95,22 +100,42 @@ class Recorder:
         self._progress(self.tally)
 
     async def _fetch(self, start: str | None) -> None:
-        """Write the archive from an instant on, in parts that the service gives out whole."""
+        """Write samples and innovations of the archive from an instant on."""
         head = await self._client.twin(self._twin)
         if head.first_time is None or head.last_time is None:
             return
-        spans = [(_us(start or head.first_time), _us(head.last_time) + 1)]
+        span = (_us(start or head.first_time), _us(head.last_time) + 1)
+        async for samples in self._parts(self._client.archive, span):
+            for row, time in enumerate(samples.time):
+                self._write(time, {name: column[row] for name, column in samples.values.items()})
+            self.tally.samples += len(samples.time)
+            self._progress(self.tally)
+        if head.active_model is not None:
+            await self._fetch_residuals(span)
+
+    async def _fetch_residuals(self, span: tuple[int, int]) -> None:
+        try:
+            async for found in self._parts(self._client.residuals, span):
+                for row, time in enumerate(found.time):
+                    values = {RESIDUAL.format(name): column[row] for name, column in found.residual_K.items()}
+                    self._write(time, values, is_sample=False)
+                self.tally.residuals += len(found.time)
+                self._progress(self.tally)
+        except ApiError as error:
+            if error.status != NOT_FOLLOWED:
+                raise
+
+    async def _parts(self, read: Callable[..., Awaitable[Part]], span: tuple[int, int]) -> AsyncIterator[Part]:
+        """Yield what lies in a span, in the order of time, in parts that the service gives out whole."""
+        spans = [span]
         while spans:
             first_us, stop_us = spans.pop()
-            part = await self._client.archive(self._twin, start=_text(first_us), stop=_text(max(first_us, stop_us)))
-            if part.downsampled:
-                middle_us = (first_us + stop_us) // 2
-                spans += [(middle_us, stop_us), (first_us, middle_us)]
+            part = await read(self._twin, start=_text(first_us), stop=_text(max(first_us, stop_us)))
+            if not part.downsampled:
+                yield part
                 continue
-            for row, time in enumerate(part.time):
-                self._write(time, {name: column[row] for name, column in part.values.items()})
-            self.tally.samples += len(part.time)
-            self._progress(self.tally)
+            middle_us = (first_us + stop_us) // 2
+            spans += [(middle_us, stop_us), (first_us, middle_us)]
 
     def _write(self, time: str, values: dict[str, float | None], *, is_sample: bool = True) -> None:
         instant_ns = 1000 * _us(time)

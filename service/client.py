@@ -312,6 +312,10 @@ class AsyncTwinClient:
         """Return a part of the archive."""
         return await self.send(calls.archive(name, {"start": start, "stop": stop}))
 
+    async def residuals(self, name: str, **parameters: str | int | float | None) -> schemas.Residuals:
+        """Return innovations and NIS between ``start`` and ``stop``."""
+        return await self.send(calls.residuals(name, parameters))
+
     async def register(self, specification: Mapping[str, Any]) -> schemas.TwinDetail:
         """Register a specification."""
         return await self.send(calls.register(specification))

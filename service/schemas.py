@@ -217,12 +217,13 @@ class Network(_Answer):
 
 
 class Residuals(_Answer):
-    """Innovations (measured minus predicted one step ahead) and their normalised squares."""
+    """Innovations (measured minus predicted one step ahead) and their normalised squares; thinned if ``downsampled``."""
 
     time: list[Instant]
     residual_K: dict[str, list[float | None]]
     nis: list[float | None]
     model_version: list[int]
+    downsampled: bool = False
 
 
 class Anomaly(_Answer):

@@ -18,7 +18,7 @@ from replay.cli.main import main
 from replay.mcap_io import read_mcap
 from service.client import TwinClient
 from tests.service.conftest import SPEC
-from tests.service.server import Server
+from tests.service.server import FAKE, Server
 
 pytestmark = pytest.mark.e2e
 
@@ -131,3 +131,24 @@ def test_the_archive_alone(server: Server, tmp_path: Path, capsys: pytest.Captur
         assert main([*argv, *more]) == 2
         assert said in capsys.readouterr().err
     assert sorted(path.suffix for path in tmp_path.glob("*.mcap*")) == [".mcap"]
+
+
+@pytest.mark.parametrize("assimilate", ["true", "false"])
+def test_the_archive_comes_with_its_innovations(tmp_path: Path, assimilate: str) -> None:
+    with Server(tmp_path, command=FAKE, assimilate=assimilate) as server, server.client() as client:
+        client.register(SPEC)
+        send(client, range(20))
+        model = {"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0}
+        assert client._http.post("/v1/twins/benchsat/models", json=model).status_code == 201
+        client.activate("benchsat", 1)
+        out = tmp_path / "all.mcap"
+        argv = ["record", "--url", server.url, "--twin", "benchsat", "--out", str(out), "--duration", "0"]
+        assert main([*argv, "--start", "1970-01-01T00:10:00Z"]) == 0
+        found = read_mcap(out)
+        np.testing.assert_array_equal(found.columns["T_px"], 290.0 + np.arange(10, 20))
+        if assimilate == "true":
+            # The stand-in for the model predicts that nothing changes; the readings rise by one kelvin a minute.
+            np.testing.assert_array_equal(found.columns["residual_T_px"], np.ones(10))
+            assert found.units["residual_T_px"] == "K"
+        else:
+            assert np.isnan(found.columns.get("residual_T_px", np.nan)).all()
