@@ -106,6 +106,9 @@ class CoreWorkbench:
             state=task.state,
         )
 
+        if not all(np.isfinite(values).all() for values in (ahead.mean_K, *ahead.quantiles_K.values())):
+            raise ModelError("the forecast is not finite; recalibrate, or activate another model")
+
         def columns(values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
             return {name: from_si(values[:, i], spec.channels[name].unit) for i, name in enumerate(ahead.sensors)}
 

@@ -1,5 +1,6 @@
 """What travels over the wire. Clients import this module and nothing else of the service."""
 
+import math
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
@@ -12,9 +13,11 @@ JobKind = Literal["calibration", "diagnosis"]
 Source = Literal["calibration", "diagnosis", "manual"]
 
 
-def _not_boolean(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise ValueError("must be a number, not true or false")
+def _finite(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError("must be a number")
+    if not abs(value) < math.inf:
+        raise ValueError("is not a finite number")
     return value
 
 
@@ -24,14 +27,14 @@ def _time_form(value: Any) -> Any:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
-Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
+Number = Annotated[float, BeforeValidator(_finite)]
+Positive = Annotated[float, BeforeValidator(_finite), Field(gt=0)]
 Time = Annotated[str | float, BeforeValidator(_time_form)]
-Quantile = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=1)]
+Share = Annotated[float, BeforeValidator(_finite), Field(gt=0, lt=1)]
 
 
 class _Request(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
 
 class _Answer(BaseModel):
@@ -82,7 +85,7 @@ class IngestReport(_Answer):
 class Columns(BaseModel):
     """Samples as columns: one value or null per time and channel, in the channel's own unit."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     time: list[Time]
     values: dict[str, list[Number | None]]
@@ -120,9 +123,9 @@ class DiagnosisRequest(_Request):
 
     start: Time | None = None
     stop: Time | None = None
-    holdout: Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=1)] = 0.3
+    holdout: Share = 0.3
     burn_in_s: Positive | None = None
-    false_alarm_rate: Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, lt=0.5)] = 0.01
+    false_alarm_rate: Annotated[float, BeforeValidator(_finite), Field(gt=0, lt=0.5)] = 0.01
     activate: bool = False
 
 
@@ -190,7 +193,7 @@ class ForecastRequest(_Request):
     horizon_s: Positive
     step_s: Positive | None = None
     plan: Columns | None = None
-    quantiles: list[Quantile] = Field(default=[0.05, 0.5, 0.95], min_length=1, max_length=20)
+    quantiles: list[Share] = Field(default=[0.05, 0.5, 0.95], min_length=1, max_length=20)
 
 
 class Forecast(_Answer):

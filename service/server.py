@@ -1,6 +1,7 @@
 """The running server: the application behind uvicorn, shut down without losing what was acknowledged."""
 
 import contextlib
+import logging
 import os
 import socket
 import sys
@@ -11,10 +12,12 @@ import uvicorn
 from service.app import create_app
 from service.core_workbench import CoreWorkbench
 from service.patience import patient
-from service.settings import Settings
+from service.settings import Settings, unknown_variables
 from service.store.database import Database
 from service.workbench import Workbench
 from twin_core.errors import TwinError
+
+log = logging.getLogger("service")
 
 SHUTDOWN_S = 10
 SWITCH_S = 0.001
@@ -46,6 +49,8 @@ def serve(
     ServerError, StoreError
         If the address or the database cannot be used.
     """
+    for name in unknown_variables(os.environ):
+        log.warning("an unknown setting is ignored", extra={"variable": name})
     listener = _listen(settings)
     database = Database(settings.database_path)
     host, port = listener.getsockname()[:2]

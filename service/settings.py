@@ -1,5 +1,6 @@
 """Settings: read once from ``TWIN_*`` environment variables into one frozen record."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,16 @@ class Settings(BaseSettings):
     def database_path(self) -> Path:
         """The SQLite file."""
         return Path(self.database_url.removeprefix("sqlite:///"))
+
+
+OF_OTHERS = frozenset({"TWIN_API_KEY"})
+"""Variables that the clients of the service read."""
+
+
+def unknown_variables(environment: Iterable[str]) -> list[str]:
+    """Return the names that look like settings and are none, most likely misspelt."""
+    known = {f"TWIN_{name.upper()}" for name in Settings.model_fields} | OF_OTHERS
+    return sorted(name for name in environment if name.upper().startswith("TWIN_") and name.upper() not in known)
 
 
 def read_settings(**overrides: Any) -> Settings:

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Response
 from starlette.responses import HTMLResponse
 
 from service.deps import NamedTwin, Running, Service, operates, reads
-from service.instants import parse_instant
+from service.instants import format_instant, parse_instant
 from service.jobs.runner import LEAST_SAMPLES
 from service.problems import BadField, Problem
 from service.registry import Entry
@@ -27,6 +27,10 @@ async def _start(service: Service, twin: Entry, kind: JobKind, request: dict[str
         raise Problem(
             422, f"the archive holds {head.samples} samples, {LEAST_SAMPLES} are needed; send telemetry first"
         )
+    if start is not None and head.last_us is not None and start > head.last_us:
+        raise BadField("start", f"comes after the last sample ({format_instant(head.last_us)})")
+    if stop is not None and head.first_us is not None and stop <= head.first_us:
+        raise BadField("stop", f"does not come after the first sample ({format_instant(head.first_us)})")
     row = await service.jobs.start(twin, kind, request)
     rooms = {"calibration": "calibrations", "diagnosis": "diagnoses"}
     response.headers["Location"] = f"/v1/twins/{twin.name}/{rooms[kind]}/{row.id}"

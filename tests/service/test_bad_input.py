@@ -10,6 +10,8 @@ import pytest
 from tests.service.harness import AppClient
 
 TELEMETRY = "/v1/twins/benchsat/telemetry"
+TWIN = "/v1/twins/benchsat"
+FORECASTS = f"{TWIN}/forecasts"
 JSON = "application/json"
 NDJSON = "application/x-ndjson"
 
@@ -72,6 +74,16 @@ INGEST = [
     Case("minus infinity", '{"time": [1], "values": {"T_px": [-Infinity]}}', 422, "values.T_px[0]"),
     Case("an overflowing number", '{"time": [1], "values": {"T_px": [1e999]}}', 422, "values.T_px[0]"),
     Case("text for a number", columns([1], T_px=["290"]), 422, "values.T_px[0]"),
+    Case("a channel twice", '{"time": [1], "values": {"T_px": [1], "T_px": [2]}}', 422, "values.T_px"),
+    Case("a channel twice, spaced", '{"time" : [1], "values" : {"T_px" : [1], "T_px" : [2]}}', 422, "values.T_px"),
+    Case("times twice", '{"time": [1], "values": {"T_px": [1]}, "time": [2]}', 422, "time"),
+    Case(
+        "frame with a channel twice",
+        '{"time": 1, "values": {}}\n{"time": 2, "values": {"T_px": 1, "T_px": 2}}',
+        422,
+        "line 2: values.T_px",
+        kind=NDJSON,
+    ),
     Case("true for a number", columns([1, 2], T_px=[290, True]), 422, "values.T_px[1]"),
     Case("a list for a number", columns([1], T_px=[[1]]), 422, "values.T_px[0]"),
     Case("an object for a number", columns([1], T_px=[{}]), 422, "values.T_px[0]"),
@@ -140,6 +152,35 @@ ELSEWHERE = [
     ),
     Case(
         "forecast: sent as text", {"horizon_s": 9}, 415, "json", path="/v1/twins/benchsat/forecasts", kind="text/plain"
+    ),
+    Case("forecast: NaN", '{"horizon_s": NaN}', 422, "is not a finite number", path=FORECASTS),
+    Case("forecast: text for a number", {"horizon_s": "600"}, 422, "horizon_s", path=FORECASTS),
+    Case("forecast: a true horizon", {"horizon_s": True}, 422, "horizon_s", path=FORECASTS),
+    Case("forecast: more than any number", {"horizon_s": 10**400}, 422, "horizon_s", path=FORECASTS),
+    Case("forecast: text quantiles", {"horizon_s": 9, "quantiles": ["0.5"]}, 422, "quantiles[0]", path=FORECASTS),
+    Case("forecast: NaN quantiles", '{"horizon_s": 9, "quantiles": [NaN]}', 422, "finite", path=FORECASTS),
+    Case(
+        "forecast: text in a plan",
+        {"horizon_s": 9, "plan": columns([1], Q_px=["1"])},
+        422,
+        "plan.values.Q_px[0]",
+        path=FORECASTS,
+    ),
+    Case("calibration: text for a choice", {"activate": "yes"}, 422, "activate", path=f"{TWIN}/calibrations"),
+    Case("diagnosis: text for a share", {"holdout": "0.3"}, 422, "holdout", path=f"{TWIN}/diagnoses"),
+    Case(
+        "spec: next to nothing",
+        spec_with(nodes=[{"id": "a", "sensor": "T", "capacity_J_per_K": {"value": 1e-300}}]),
+        422,
+        "nodes[0].capacity_J_per_K.value",
+        path="/v1/twins",
+    ),
+    Case(
+        "spec: out of all proportion",
+        spec_with(nodes=[{"id": "a", "sensor": "T", "capacity_J_per_K": {"guess": 1e300}}]),
+        422,
+        "nodes[0].capacity_J_per_K.guess",
+        path="/v1/twins",
     ),
     Case("spec: no nodes", spec_with(nodes=[]), 422, "nodes", path="/v1/twins"),
     Case("spec: bad id", spec_with(twin="Other Twin"), 422, "twin", path="/v1/twins"),

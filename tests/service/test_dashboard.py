@@ -128,6 +128,10 @@ def test_a_key_is_asked_for_where_one_is_needed(tmp_path: Path) -> None:
         with Browser(tmp_path / "profile") as page:
             page.open(server.url)
             page.until("document.getElementById('key-dialog').open")
+            assert page.evaluate("document.getElementById('key-refused').hidden")
+            page.evaluate("document.getElementById('key').value = 'open'")
+            page.click("#key-dialog button")
+            page.until("document.getElementById('key-dialog').open && !document.getElementById('key-refused').hidden")
             page.evaluate("document.getElementById('key').value = 'sesame'")
             page.click("#key-dialog button")
             page.until("document.getElementById('twin').value === 'benchsat'")

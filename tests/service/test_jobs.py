@@ -253,3 +253,12 @@ def test_a_model_with_guesses_and_couplings_of_its_own_is_taken(client: AppClien
     spec["conductors"] = []
     spec["nodes"][0]["capacity_J_per_K"] = {"guess": 1e5}
     assert client.post(f"{TWIN}/models", json={"spec": spec, "max_step_s": 60.0}).status_code == 201
+
+
+@pytest.mark.parametrize("room", ["calibrations", "diagnoses"])
+def test_a_job_on_a_time_without_samples_is_refused_at_once(client: AppClient, room: str) -> None:
+    feed(client, 0.5)  # samples at 0 to 119 s
+    for field, request in (("start", {"start": 119.5}), ("stop", {"stop": 0})):
+        response = client.post(f"{TWIN}/{room}", json=request)
+        assert response.status_code == 422 and response.json()["errors"][0]["field"] == field
+    assert client.get(f"{TWIN}/{room}").json() == {"jobs": []}

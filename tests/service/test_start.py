@@ -1,9 +1,13 @@
 """What a start costs: no heavy import, neither for the server nor for its clients."""
 
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
+
+from tests.service.server import Server
 
 HEAVY = ("torch", "numba", "scipy", "pandas", "skfem", "sympy")
 
@@ -42,3 +46,10 @@ def test_the_dashboard_is_served_whole(client) -> None:
         assert client.get(f"/assets/{asset}").status_code == 200
     assert client.get("/assets/../app.py").status_code == 404
     assert "MIT" in client.get("/assets/uplot/LICENSE").text
+
+
+@pytest.mark.e2e
+def test_a_misspelt_setting_is_told(tmp_path: Path) -> None:
+    with Server(tmp_path, job_worker="2", api_key="secret", log_level="warning") as server:
+        lines = [json.loads(line) for line in server.log().splitlines()]
+    assert [line["variable"] for line in lines] == ["TWIN_JOB_WORKER"] and lines[0]["level"] == "warning"

@@ -13,9 +13,11 @@ from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import TwinSpec, dump_spec, load_spec
-from twin_core.parameters.transforms import is_logarithmic
+from twin_core.parameters.transforms import Log, is_logarithmic
 
 FORMAT = "thermal-twin-model/1"
+LEAST_STEP_S = 1e-3
+"""No thermal record is sampled faster; a shorter step would only fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,8 @@ class CalibratedModel:
             for name, value in row.items():
                 if not (np.isfinite(value) and value > 0.0):
                     raise SpecError(f"{field_name}.{name}: must be a positive number".lstrip("."))
+        if self.max_step_s < LEAST_STEP_S:
+            raise SpecError(f"max_step_s: must be at least {LEAST_STEP_S:g} s (got {self.max_step_s:g})")
         if not all(np.isfinite(value) and value >= 0.0 for value in self.misfit_K.values()):
             raise SpecError("misfit_K: must be numbers of at least 0")
         if not np.isfinite(self.covariance).all():
@@ -163,8 +167,12 @@ class CalibratedModel:
         if self.free_names and self.free_names != parameters.free_names:
             raise SpecError("free_names: are not the free parameters of the specification and its effects")
         for parameter in parameters.parameters:
-            if is_logarithmic(parameter.transform) and not parameter.value > 0.0:
+            if not is_logarithmic(parameter.transform):
+                continue
+            if not parameter.value > 0.0:
                 raise SpecError(f"values.{parameter.name}: must be positive")
+            if not Log().to_value(-np.inf) <= parameter.value <= Log().to_value(np.inf):
+                raise SpecError(f"values.{parameter.name}: is out of all proportion ({parameter.value:g})")
 
 
 def _damaged(name: str, wanted: str) -> NoReturn:

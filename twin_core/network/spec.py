@@ -32,6 +32,8 @@ def _not_boolean(value: Any) -> Any:
 
 Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
 Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
+Magnitude = Annotated[float, BeforeValidator(_not_boolean), Field(ge=1e-12, le=1e15, allow_inf_nan=False)]
+"""A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
 Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
 Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
 _NAME = r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$"
@@ -46,8 +48,8 @@ class _Strict(BaseModel):
 class Quantity(_Strict):
     """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``)."""
 
-    value: Positive | None = None
-    guess: Positive | None = None
+    value: Magnitude | None = None
+    guess: Magnitude | None = None
     bounds: tuple[Positive, Positive] | None = None
 
     @model_validator(mode="after")
@@ -84,7 +86,7 @@ class Channel(_Strict):
 
     kind: Literal["temperature", "power", "auxiliary"]
     unit: str | None = None
-    noise_std: Positive | None = None
+    noise_std: Magnitude | None = None
     interpolation: Literal["hold", "linear"] | None = None
     levels: StrictBool = False
 
@@ -143,7 +145,7 @@ class Radiator(_Strict):
 
     node: Name
     emissivity: Fraction
-    area_m2: Positive
+    area_m2: Magnitude
     sink: Name
 
 

@@ -81,6 +81,10 @@ def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *,
     return filled[interval]
 
 
+MOST_STEPS = 20_000_000
+"""Decades of minutes; each step costs some hundred bytes."""
+
+
 def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcing:
     """Return the forcing of a record: every sample is a step's end, long intervals are divided.
 
@@ -96,13 +100,18 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     Raises
     ------
     TelemetryError
-        If a channel that drives the network is missing or empty, a solar load meets a record without dates, or the
-        network knows instants in another form than the record's.
+        If the record is too long for so short a step, a channel that drives the network is missing or empty, a solar
+        load meets a record without dates, or the network knows instants in another form than the record's.
     """
     spec = network.spec
     _check_clock(network, record)
     intervals = np.diff(record.time_s)
-    divisions = np.maximum(1, np.ceil(intervals / max_step_s - 1e-9)).astype(np.int64)
+    steps = np.maximum(1.0, np.ceil(intervals / max_step_s - 1e-9))
+    if steps.sum() > MOST_STEPS:
+        raise TelemetryError(
+            f"{steps.sum():.3g} steps of at most {max_step_s:g} s are more than {MOST_STEPS:g}; take a shorter record"
+        )
+    divisions = steps.astype(np.int64)
     step = np.repeat(intervals / divisions, divisions)
     interval = np.repeat(np.arange(intervals.size), divisions)
     within = np.arange(step.size) - np.repeat(np.cumsum(divisions) - divisions, divisions)

@@ -8,19 +8,19 @@ export class ApiError extends Error {
   constructor(status, detail) { super(detail); this.status = status; }
 }
 
-const headers = () => {
-  const key = sessionStorage.getItem(KEY);
+const headers = (key = sessionStorage.getItem(KEY)) => {
   return key ? { Authorization: `Bearer ${key}` } : {};
 };
 
 export async function call(path, { method = "GET", body } = {}) {
+  const key = sessionStorage.getItem(KEY);
   const response = await fetch(path, {
     method,
-    headers: { ...headers(), ...(body === undefined ? {} : { "Content-Type": "application/json" }) },
+    headers: { ...headers(key), ...(body === undefined ? {} : { "Content-Type": "application/json" }) },
     body: body === undefined ? undefined : JSON.stringify(body),
   });
   if (response.status === 401) {
-    sessionStorage.setItem(KEY, await askForKey());
+    sessionStorage.setItem(KEY, await askForKey(Boolean(key)));
     return call(path, { method, body });
   }
   if (!response.ok) {

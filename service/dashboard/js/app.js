@@ -352,8 +352,9 @@ function pressed(event) {
 // ---- beginning
 
 
-onKeyNeeded(() => new Promise((resolve) => {
+onKeyNeeded((refused) => new Promise((resolve) => {
   const dialog = $("key-dialog");
+  $("key-refused").hidden = !refused;
   dialog.showModal();
   dialog.addEventListener("close", () => resolve($("key").value), { once: true });
 }));

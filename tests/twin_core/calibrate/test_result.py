@@ -111,6 +111,8 @@ def test_a_missing_field_is_named(field: str) -> None:
         (lambda d: d["spec"]["nodes"][0].update(id="9"), "nodes"),
         (lambda d: d["table_knots"][0].pop("node"), "node: is missing"),
         (lambda d: d["max_step_s"] and d.update(max_step_s=-1.0), "max_step_s"),
+        (lambda d: d.update(max_step_s=1e-9), "max_step_s: must be at least 0.001 s"),
+        (lambda d: d["values"].update({"C:a": 1e-300}), r"values\.C:a: is out of all proportion"),
         (lambda d: d["noise_K"].update(T_a=float("nan")), "noise_K"),
         (lambda d: d["noise_K"].update(T_a=-0.1), "noise_K"),
         (lambda d: d["misfit_length_s"].update(T_a=float("inf")), "misfit_length_s"),

@@ -61,6 +61,11 @@ def test_long_intervals_are_divided_evenly() -> None:
     assert forcing.n_steps == 6
 
 
+def test_more_steps_than_memory_holds_are_refused() -> None:
+    with pytest.raises(TelemetryError, match=r"2\.4e\+11 steps of at most 1e-09 s"):
+        build(samples(), max_step_s=1e-9)
+
+
 def test_power_and_levels_hold_from_their_sample_to_the_next() -> None:
     forcing = build(samples(), max_step_s=50.0)
     expected = np.repeat([1.0, 1.0, 2.0, 4.0, 4.0, 4.0], 2).reshape(6, 2)
