@@ -40,8 +40,6 @@ Units = Mapping[str, str | None]
 TOLD_BY_THE_ARCHIVE = frozenset({"time", "values", "units", "samples", "downsampled"})
 """What the archive answers can be sent to ingest: units are compared, the others say nothing about the samples."""
 
-NAME_ENDS = b'":'
-
 
 def parse_columns(body: bytes, channels: Units) -> Batch:
     """Return the batch of ``{"time": [...], "values": {channel: [...]}}``; ``units`` may stand beside them.
@@ -54,10 +52,11 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
     document = _load(body, "body")
     times, columns = _members(document, "", TOLD_BY_THE_ARCHIVE)
     units = document.get("units", {})
-    _refuse_repeated(body, len(document) + len(columns) + (len(units) if isinstance(units, dict) else 0), "")
     if not isinstance(times, list):
         raise BadField("time", "must be a list")
     _check_units(units, channels)
+    texts = len(document) + len(columns) + len(units) + sum(unit is not None for unit in units.values())
+    _refuse_repeated(body, texts + [*map(type, times)].count(str), "")
     n_times, names = len(times), list(channels)
     for name, column in columns.items():
         if name not in channels or type(column) is not list or len(column) != n_times:
@@ -120,10 +119,10 @@ def parse_frames(body: bytes, channels: Units) -> Batch:
     """
     lines = [(number, line) for number, line in enumerate(body.split(b"\n"), start=1) if line.strip()]
     frames = [_members(_load(line, f"line {number}"), f"line {number}: ") for number, line in lines]
-    n_names = sum(len(sample) for _, sample in frames) + 2 * len(frames)
-    if body.count(NAME_ENDS) != n_names:
-        for (number, line), (_, sample) in zip(lines, frames, strict=True):
-            _refuse_repeated(line, len(sample) + 2, f"line {number}: ")
+    n_texts = [2 + len(sample) + (type(time) is str) for time, sample in frames]
+    if body.count(b'"') != 2 * sum(n_texts):
+        for (number, line), n in zip(lines, n_texts, strict=True):
+            _refuse_repeated(line, n, f"line {number}: ")
     known = set(channels)
     for (number, _), (_, sample) in zip(lines, frames, strict=True):
         if not known.issuperset(sample):
@@ -153,13 +152,18 @@ def _load(body: bytes, where: str) -> Any:
         ) from None
 
 
-def _refuse_repeated(body: bytes, n_names: int, prefix: str) -> None:
+def _refuse_repeated(body: bytes, n_texts: int, prefix: str) -> None:
     """Refuse a name that stands twice in one object, of which the parser keeps the last (422 naming it).
 
-    Counting is quick and nearly always enough; only a body with more names than the parser found is read again.
+    Counting quotation marks is quick; only a body with others than those of the names and texts that the parser found
+    is read again.
     """
-    if body.count(NAME_ENDS) != n_names:
-        json.loads(body, object_pairs_hook=partial(_refuse_repeated_in, prefix))
+    if body.count(b'"') == 2 * n_texts:
+        return
+    try:
+        json.loads(body, object_pairs_hook=partial(_refuse_repeated_in, prefix), parse_int=float)
+    except RecursionError:
+        raise BadField(f"{prefix}body", "is nested too deeply") from None
 
 
 def _refuse_repeated_in(prefix: str, pairs: list[tuple[str, Any]]) -> dict[str, Any]:

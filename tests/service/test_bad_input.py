@@ -76,6 +76,18 @@ INGEST = [
     Case("text for a number", columns([1], T_px=["290"]), 422, "values.T_px[0]"),
     Case("a channel twice", '{"time": [1], "values": {"T_px": [1], "T_px": [2]}}', 422, "values.T_px"),
     Case("a channel twice, spaced", '{"time" : [1], "values" : {"T_px" : [1], "T_px" : [2]}}', 422, "values.T_px"),
+    Case(
+        "a channel twice among units",
+        '{"time": ["2026-01-01T00:00:00Z", 7], "units": {"T_px": "K"}, "values": {"T_px": [1, 2], "T_px": [1, 2]}}',
+        422,
+        "values.T_px",
+    ),
+    Case(
+        "deep nesting beside the samples",
+        '{"time": [1, "x"], "values": {"T_px": [1, 2]}, "samples": ' + "[" * 1000 + "]" * 1000 + "}",
+        422,
+        "time[1]",
+    ),
     Case("times twice", '{"time": [1], "values": {"T_px": [1]}, "time": [2]}', 422, "time"),
     Case(
         "frame with a channel twice",
