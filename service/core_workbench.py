@@ -39,10 +39,10 @@ class CoreWorkbench:
         progress(0.92, "scoring on recent data")
         held = _held_out(spec, train, recent)
         rmse_K = _rmse_K(model, held)
-        rival = None if task.rival is None or held is None else _rmse_K(_model_of(task.rival), held)
+        rival = None if task.rival is None else _rmse_K(_model_of(task.rival), held)
         validation = {
-            "rmse_K": rmse_K if held is not None else model.summary.get("rmse_K"),
-            "on": "recent data held back" if held is not None else "the training data: too few to hold any back",
+            "rmse_K": rmse_K if held else model.summary.get("rmse_K"),
+            "on": "recent data held back" if held else "the training data: too few to hold any back",
             "samples": int(recent.time_us.size),
         }
         return _outcome(model, validation, rival)
@@ -140,27 +140,32 @@ def _record(spec: Any, telemetry: Telemetry) -> Any:
     return Record(time_s, values, telemetry.epoch_us * 1000, "archive")
 
 
-def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> Any:
-    """Return the recent data as a hold-out that follows on the training data, or None if there is too little."""
-    from twin_core.discover.holdout import HeldOut
+def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:
+    """Return the recent data as hold-outs, the first of which may follow on the training data; none if there is too little."""
+    from twin_core.discover.holdout import HeldOut, split_burn_in
+    from twin_core.telemetry import LEAST_PART, cut_at_gaps
 
     if recent.time_us.size < 3:
-        return None
+        return []
     last = train.since(int(train.time_us[-1]))
     values = {name: np.concatenate([last.values[name], column]) for name, column in recent.values.items()}
-    scored = Telemetry(recent.epoch_us, np.concatenate([last.time_us, recent.time_us]), values)
-    return HeldOut(_record(spec, train), _record(spec, scored))
+    joined = Telemetry(recent.epoch_us, np.concatenate([last.time_us, recent.time_us]), values)
+    lead = _record(spec, train)
+    parts = cut_at_gaps([_record(spec, joined)], spec.driving_channels)
+    follows = [part.time_s[0] == lead.time_s[-1] for part in parts]
+    long = [part.time_s.size >= LEAST_PART for part in parts]
+    held = zip(parts, follows, long, strict=True)
+    return [HeldOut(lead, p) if follow else split_burn_in(p, None) for p, follow, enough in held if follow or enough]
 
 
-def _rmse_K(model: Any, held: Any) -> float | None:
-    """Return the open-loop error of a model on the hold-out, over every reading."""
+def _rmse_K(model: Any, held: list[Any]) -> float | None:
+    """Return the open-loop error of a model on the hold-outs, over every reading."""
     from twin_core.discover.holdout import predict
 
-    if held is None:
-        return None
-    prediction = predict(model, held)
-    squares = (prediction.measured_K - prediction.predicted_K) ** 2
-    return float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None
+    predictions = [predict(model, one) for one in held]
+    squares = [((p.measured_K - p.predicted_K) ** 2).ravel() for p in predictions]
+    every = np.concatenate([np.empty(0), *squares])
+    return float(np.sqrt(np.nanmean(every))) if np.isfinite(every).any() else None
 
 
 def _model_of(document: Json) -> Any:

@@ -85,7 +85,7 @@ class Intake:
             if counts[status]:
                 self._metrics.samples.labels(twin.name, outcome).inc(counts[status])
         if counts[ACCEPTED]:
-            self._live.arrived(twin, batch.time_us[receipt.stored])
+            self._live.arrived(twin)
 
 
 def _joined(batches: list[Batch]) -> Batch:

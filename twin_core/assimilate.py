@@ -4,7 +4,8 @@ An iterated extended Kalman filter: the heat balance is linearised about the fil
 the compiled linear filter runs over it. What the calibration left unexplained enters as process noise.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,13 +20,16 @@ from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.one_step import one_step
-from twin_core.telemetry import Record
+from twin_core.telemetry import GAP_STEPS, Record
 
 N_PASSES = 3
 START_STD_SENSED_K = 2.0
 START_STD_HIDDEN_K = 20.0
 FLOOR_SHARE = 0.02
 """Process noise per sample is at least this share of the sensor noise: a filter that is certain of itself goes deaf."""
+
+MOST_STEPS = 20_000
+"""About so many time steps are filtered at once, whatever the record's length: memory stays bounded."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +98,7 @@ def assimilate(model: CalibratedModel, record: Record, state: Json | None = None
     model
         The model, effects included.
     record
-        Telemetry in SI, one segment.
+        Telemetry in SI, one segment. After a gap of more than ``GAP_STEPS`` steps the filter starts anew.
     state
         The ``state`` of an earlier assimilation whose last sample is the first one of ``record``; its reading is then
         not used twice. By default the filter starts from the first readings.
@@ -114,30 +118,98 @@ def assimilate(model: CalibratedModel, record: Record, state: Json | None = None
         measured[0] = np.nan
     elif not np.isfinite(measured).any():
         raise TelemetryError(f"{record.name}: holds no reading of {', '.join(model.spec.sensors)}")
+    parts = record.parts(GAP_STEPS * model.max_step_s, model.spec.driving_channels)
+    stops = np.cumsum([part.time_s.size for part in parts])
+    now = _known(network, state)
+    found: list[_Stretch] = []
+    for part, readings in zip(parts, np.split(measured, stops[:-1]), strict=True):
+        if now is None and not np.isfinite(readings).any():
+            found.append(_Stretch.blind(readings))
+            continue
+        if now is None or part is not parts[0]:
+            now = _start(network, readings, part, now)
+        sampling_s = float(np.median(np.diff(part.time_s))) if part.time_s.size > 1 else 1.0
+        density = process_noise_K2_per_s(model, network, sampling_s)
+        for first, stop in _bounded(part.time_s, model.max_step_s):
+            piece, fresh = part.take(np.arange(first, stop)), readings[first:stop].copy()
+            if first:  # this sample ended the piece before
+                fresh[0] = np.nan
+            done = _filter(model, network, piece, fresh, now, density)
+            found.append(done if first == 0 else done.after_first())
+            now = done.mean_K, done.covariance_K2
+    assert now is not None
+    return Assimilation(
+        record.time_s,
+        model.spec.sensors,
+        np.concatenate([f.innovation_K for f in found]),
+        np.concatenate([f.innovation_std_K for f in found]),
+        np.concatenate([f.nis for f in found]),
+        network.nodes,
+        *now,
+    )
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """A filtered piece of a record: one row per sample, and the state at its end."""
+
+    innovation_K: FloatArray
+    innovation_std_K: FloatArray
+    nis: FloatArray
+    mean_K: FloatArray
+    covariance_K2: FloatArray
+
+    @classmethod
+    def blind(cls, readings: FloatArray) -> "_Stretch":
+        """Return a piece about which nothing is known, not even where it starts."""
+        nothing = np.full_like(readings, np.nan)
+        return cls(nothing, nothing, nothing[:, 0], np.empty(0), np.empty((0, 0)))
+
+    def after_first(self) -> "_Stretch":
+        """Return the piece without its first sample."""
+        return replace(
+            self,
+            innovation_K=self.innovation_K[1:],
+            innovation_std_K=self.innovation_std_K[1:],
+            nis=self.nis[1:],
+        )
+
+
+def _bounded(time_s: FloatArray, max_step_s: float) -> Iterator[tuple[int, int]]:
+    """Yield (first, stop) of pieces of about ``MOST_STEPS`` time steps; each begins with the last sample of the one before."""
+    steps = np.concatenate([[0.0], np.cumsum(np.ceil(np.diff(time_s) / max_step_s))])
+    first = 0
+    while True:
+        stop = max(int(np.searchsorted(steps, steps[first] + MOST_STEPS, side="right")), first + 2)
+        yield first, min(stop, time_s.size)
+        if stop >= time_s.size:
+            return
+        first = stop - 1
+
+
+def _filter(
+    model: CalibratedModel,
+    network: Network,
+    record: Record,
+    measured: FloatArray,
+    prior: tuple[FloatArray, FloatArray],
+    density: FloatArray,
+) -> _Stretch:
+    """Filter a piece of a record from a mean and a covariance of its first state."""
     forcing = build_forcing(network, record, model.max_step_s)
-    prior_mean, prior_cov = _prior(network, measured, record, state)
-    filled = filled_columns(network, record.time_s, measured, prior_mean)
+    filled = filled_columns(network, record.time_s, measured, prior[0])
     stretched = np.full((forcing.n_steps + 1, measured.shape[1]), np.nan)
     stretched[forcing.sample_step] = measured
     starts = _spread(filled, forcing)
-    sampling = float(np.median(np.diff(record.time_s))) if record.time_s.size > 1 else 1.0
-    density = process_noise_K2_per_s(model, network, sampling)
     filtered = None
     for _ in range(N_PASSES):
-        linear = _linear_model(network, forcing, starts, density, prior_mean, prior_cov, model.noise_vector_K())
+        linear = _linear_model(network, forcing, starts, density, *prior, model.noise_vector_K())
         filtered = kalman_filter(linear, stretched, keep="states")
         starts = filtered.mean[:-1]
     assert filtered is not None
     at = forcing.sample_step
-    return Assimilation(
-        record.time_s,
-        model.spec.sensors,
-        filtered.innovation[at],
-        filtered.innovation_std[at],
-        filtered.nis[at],
-        network.nodes,
-        filtered.mean[-1],
-        filtered.cov[-1],
+    return _Stretch(
+        filtered.innovation[at], filtered.innovation_std[at], filtered.nis[at], filtered.mean[-1], filtered.cov[-1]
     )
 
 
@@ -147,17 +219,25 @@ def _readings(model: CalibratedModel, network: Network, record: Record) -> Float
     return measured_temperatures(model.spec, record) - offset_K
 
 
-def _prior(network: Network, measured: FloatArray, record: Record, state: Json | None) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of the first state."""
+def _known(network: Network, state: Json | None) -> tuple[FloatArray, FloatArray] | None:
+    """Return mean and covariance of an earlier assimilation; None if there is none, or of other nodes."""
+    if state is None or state["nodes"] != list(network.nodes):
+        return None
     n_nodes = len(network.nodes)
-    if state is not None and state["nodes"] == list(network.nodes):
-        return np.array(state["mean_K"]), np.array(state["covariance_K2"]).reshape(n_nodes, n_nodes)
-    mean = filled_columns(network, record.time_s, measured, None)[0]
-    std = np.full(n_nodes, START_STD_HIDDEN_K)
+    return np.array(state["mean_K"]), np.array(state["covariance_K2"]).reshape(n_nodes, n_nodes)
+
+
+def _start(
+    network: Network, measured: FloatArray, record: Record, before_gap: tuple[FloatArray, FloatArray] | None
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance where a record starts; where it holds no reading, what was known before the gap stays."""
+    std = np.full(len(network.nodes), START_STD_HIDDEN_K)
+    if before_gap is not None and not np.isfinite(measured).any():
+        return before_gap[0], np.diag(std**2)
     for sensor, node in enumerate(network.sensor_node):
         if np.isfinite(measured[:, sensor]).any():
             std[node] = START_STD_SENSED_K
-    return mean, np.diag(std**2)
+    return filled_columns(network, record.time_s, measured, None)[0], np.diag(std**2)
 
 
 def _spread(filled: FloatArray, forcing: Forcing) -> FloatArray:

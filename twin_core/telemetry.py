@@ -1,6 +1,7 @@
 """A record: channels on one strictly increasing time axis, in SI, with NaN where a sample is missing."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,6 +9,11 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.errors import TelemetryError
 from twin_core.units import format_instant, parse_instant_ns
+
+GAP_STEPS = 10_000
+"""What happened in an interval of more steps than this nobody knows: what comes after it is a record of its own."""
+LEAST_PART = 20
+"""Parts of a record between two gaps that have fewer samples are fitted to only where there are no others."""
 
 
 @dataclass(frozen=True)
@@ -90,3 +96,37 @@ class Record:
                 raise TelemetryError(f"{self.name}: '{time}' is a date, the record counts seconds")
             return (parse_instant_ns(time) - self.epoch_ns) / 1e9
         return float(time)
+
+    def parts(self, longest_s: float, held: AbstractSet[str]) -> list["Record"]:
+        """Return the record cut at intervals of more than ``longest_s``; ``held`` channels keep their values across."""
+        starts = [0, *(np.flatnonzero(np.diff(self.time_s) > longest_s) + 1).tolist()]
+        if len(starts) == 1:
+            return [self]
+        stops, last, parts = [*starts[1:], self.time_s.size], dict.fromkeys(held, np.nan), []
+        for first, stop in zip(starts, stops, strict=True):
+            part = self.take(np.arange(first, stop))
+            for name in held & self.values.keys():
+                column = part.values[name]
+                if np.isnan(column[0]):
+                    column[0] = last[name]
+                finite = column[np.isfinite(column)]
+                last[name] = float(finite[-1]) if finite.size else np.nan
+            parts.append(part)
+        return parts
+
+
+def cut_at_gaps(records: Sequence[Record], held: AbstractSet[str]) -> list[Record]:
+    """Return records without intervals of more than ``GAP_STEPS`` usual ones, and without scraps between such gaps.
+
+    A fit would otherwise step through a gap, however long: one sample from a clock that is wrong by a century is enough.
+    """
+    parts = [part for record in records for part in _uninterrupted(record, held)]
+    if len(parts) == len(records):
+        return parts
+    return [part for part in parts if part.time_s.size >= LEAST_PART] or [max(parts, key=lambda part: part.time_s.size)]
+
+
+def _uninterrupted(record: Record, held: AbstractSet[str]) -> list[Record]:
+    if record.time_s.size < 2:
+        return [record]
+    return record.parts(GAP_STEPS * float(np.median(np.diff(record.time_s))), held)

@@ -24,6 +24,7 @@ from service.store.models import Active
 from service.streams import Hub
 from service.workbench import CalibrationTask, DiagnosisTask, Telemetry, Workbench, work
 from twin_core import __version__
+from twin_core.telemetry import GAP_STEPS
 
 log = logging.getLogger("service.jobs")
 
@@ -223,11 +224,13 @@ def _wish(row: JobRow, request: Json) -> bool | None:
 def validation_start(telemetry: Telemetry, active_stop_us: int | None) -> int:
     """Return where the data begin that neither the new model nor the active one may have been fitted to.
 
-    That is the last fifth of the time span, or what came after the active model's training data if that is shorter;
-    the end of the archive if too few samples would be left to score or to train on.
+    That is the last fifth of the time that the samples cover, long gaps not counted, or what came after the active
+    model's training data if that is shorter; the end of the archive if too few samples would be left to score or to train on.
     """
-    first, last = int(telemetry.time_us[0]), int(telemetry.time_us[-1])
-    cut = int(first + (1.0 - VALIDATION_SHARE) * (last - first))
+    last, intervals = int(telemetry.time_us[-1]), np.diff(telemetry.time_us)
+    usual = np.where(intervals > GAP_STEPS * np.median(intervals), 0, intervals)
+    covered = np.concatenate([[0], np.cumsum(usual)])
+    cut = int(telemetry.time_us[np.searchsorted(covered, (1.0 - VALIDATION_SHARE) * covered[-1])])
     if active_stop_us is not None:
         cut = max(cut, active_stop_us + 1)
     position = int(np.searchsorted(telemetry.time_us, cut))

@@ -19,6 +19,10 @@ WORKERS = 2
 log = logging.getLogger("service.live")
 
 
+class WorkerDied(Problem):
+    """A worker process dies over this question, even where it has one to itself."""
+
+
 class Engine:
     """Runs quick questions to a workbench outside of the server's process."""
 
@@ -49,19 +53,25 @@ class Engine:
             await asyncio.to_thread(self._pool.shutdown, True, cancel_futures=True)
 
     async def _ask(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        for _ in range(2):
-            pool = self._pool = self._pool or self._start()
-            try:
-                return await asyncio.wrap_future(pool.submit(function, *args, **kwargs))
-            except BrokenProcessPool:
-                log.warning("a worker process died; another one takes over")
-                if self._pool is pool:
-                    self._pool = None
-        raise Problem(503, "the worker process died twice over this request; try again or recalibrate")
+        pool = self._pool = self._pool or _start(WORKERS)
+        try:
+            return await asyncio.wrap_future(pool.submit(function, *args, **kwargs))
+        except BrokenProcessPool:
+            log.warning("a worker process died; another one takes over")
+            if self._pool is pool:
+                self._pool = None
+        alone = _start(1)  # whether it was this question or a neighbour's that the process died of
+        try:
+            return await asyncio.wrap_future(alone.submit(function, *args, **kwargs))
+        except BrokenProcessPool:
+            raise WorkerDied(503, "the worker process died twice over this request; try again or recalibrate") from None
+        finally:
+            alone.shutdown(wait=False)
 
-    def _start(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(WORKERS, mp_context=context, initializer=prepare_worker)
+
+def _start(workers: int) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_worker)
 
 
 def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json | None) -> Filtered:

@@ -1,7 +1,5 @@
 """The live state of every twin: one tracker each, and the engine they share."""
 
-from numpy.typing import NDArray
-
 from service.live.engine import Engine
 from service.live.tracker import Tracker
 from service.metrics import Metrics
@@ -46,11 +44,11 @@ class Live:
             )
         return tracker
 
-    def arrived(self, twin: Entry, time_us: NDArray) -> None:
+    def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""
         tracker = self._trackers.get(twin.key)
         if tracker is not None:
-            tracker.arrived(time_us)
+            tracker.arrived()
 
     def model_changed(self, twin: int) -> None:
         """Pass on that another model is active."""

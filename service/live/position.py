@@ -12,13 +12,18 @@ from service.store.samples import Samples
 from service.workbench import Telemetry
 
 Json = dict[str, Any]
+_KEPT = ("seq", "state", "held", "detector", "sampling_s")
 
 
 @dataclass(frozen=True)
 class Position:
-    """Where the assimilation stands: the last assimilated sample, its state, and the inputs that hold there."""
+    """Where the assimilation stands: the last assimilated sample, its state, and the inputs that hold there.
+
+    ``seq`` is the number at which the stream stood when the archive was read up to here.
+    """
 
     time_us: int
+    seq: int
     n_samples: int
     state: Json
     held: dict[str, float]
@@ -29,14 +34,11 @@ class Position:
     def of(cls, checkpoint: Checkpoint) -> "Position":
         """Return the position that a checkpoint describes."""
         body = checkpoint.body
-        return cls(
-            checkpoint.time_us, checkpoint.n_samples, body["state"], body["held"], body["detector"], body["sampling_s"]
-        )
+        return cls(checkpoint.time_us, n_samples=checkpoint.n_samples, **{name: body[name] for name in _KEPT})
 
     def checkpoint(self) -> Checkpoint:
         """Return the checkpoint that describes this position."""
-        names = ("state", "held", "detector", "sampling_s")
-        return Checkpoint(self.time_us, self.n_samples, {name: getattr(self, name) for name in names})
+        return Checkpoint(self.time_us, self.n_samples, {name: getattr(self, name) for name in _KEPT})
 
 
 def stretch(twin: Entry, fresh: Samples, epoch_us: int, before: Position | None) -> tuple[Telemetry, dict[str, float]]:
@@ -59,6 +61,22 @@ def stretch(twin: Entry, fresh: Samples, epoch_us: int, before: Position | None)
             values[name] = column
     known_us = [] if before is None else [before.time_us]
     return Telemetry(epoch_us, np.concatenate([np.array(known_us, dtype=np.int64), fresh.time_us]), values), after
+
+
+def next_count(time_us: NDArray[np.int64], before: Position | None, longest_gap_us: float) -> int:
+    """Return how many of the next samples are assimilated together: none beyond a long gap, of which a step begins.
+
+    A single sample after a long gap waits for another one: it may be that only its clock is wrong.
+    """
+    if before is None or time_us.size == 0:
+        known = time_us
+    else:
+        known = np.concatenate([[before.time_us], time_us])
+    offset = known.size - time_us.size
+    gaps = np.flatnonzero(np.diff(known) > longest_gap_us) + 1 - offset
+    if offset and time_us.size == 1 and gaps.size:
+        return 0
+    return int(min((gap for gap in gaps if gap > 0), default=time_us.size))
 
 
 def sampling_s(time_us: NDArray[np.int64], before: Position | None) -> float:

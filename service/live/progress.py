@@ -21,13 +21,16 @@ BLOCK = 5000
 """At most so many samples are assimilated in one step."""
 
 Json = dict[str, Any]
+_NONE = np.empty(0, dtype=np.int64)
 
 
 @dataclass(frozen=True)
 class Step:
-    """What one step of assimilation found."""
+    """What one step of assimilation found: ``after_us`` is the instant before it, ``after_gap`` whether that is long ago."""
 
     version: int
+    after_us: int
+    after_gap: bool
     time_us: NDArray[np.int64]
     innovation_K: NDArray[np.float64]
     innovation_std_K: NDArray[np.float64]
@@ -35,6 +38,33 @@ class Step:
     told: NDArray[np.bool_]
     changes: list[Change]
     checkpoint: Checkpoint
+
+    @property
+    def span_us(self) -> tuple[int, int]:
+        """The instants (after, until] that this step covers."""
+        return self.after_us, int(self.time_us[-1])
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What the archive holds beyond a position.
+
+    Attributes
+    ----------
+    seq
+        The stream stood at this number.
+    late_us
+        First instant of a sample that lies before the position, came after it was read and matters; None if there is none.
+    fresh
+        The next samples.
+    told : (n_times,)
+        Which of them nobody was told about yet.
+    """
+
+    seq: int
+    late_us: int | None
+    fresh: Samples
+    told: NDArray[np.bool_]
 
 
 def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:
@@ -49,11 +79,11 @@ def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None,
     residuals.append(connection, twin.key, found)
     if n_told:
         stretches.append(ResidualStretch(twin.sensors, found.take(step.told)))
-    rows = anomalies.apply(connection, twin.key, step.version, step.changes)
+    rows = anomalies.apply(connection, twin.key, step.version, step.changes, step.span_us)
     if rows:
         messages = [("anomaly", {"anomaly": row.wire()}) for row in rows]
         stretches.append(EventStretch(tuple(events.append(connection, twin.key, now_us(), messages))))
-    checkpoints.put(connection, twin.key, step.version, step.checkpoint)
+    checkpoints.put(connection, twin.key, step.version, step.checkpoint, keep_previous=step.after_gap)
     return None, stretches
 
 
@@ -63,22 +93,60 @@ def rewind(connection: sqlite3.Connection, twin: Entry, version: int, late_us: i
     after_us = -(2**62) if checkpoint is None else checkpoint.time_us
     checkpoints.forget_after(connection, twin.key, version, after_us)
     residuals.truncate(connection, twin.key, version, len(twin.sensors), after_us)
-    anomalies.rewind(connection, twin.key, version, after_us)
+    return _dated(connection, twin, checkpoint)
+
+
+def resume(connection: sqlite3.Connection, twin: Entry, version: int) -> tuple[Checkpoint | None, int]:
+    """Return where a version stands, and the number at which the stream does."""
+    checkpoint = _dated(connection, twin, checkpoints.before(connection, twin.key, version))
+    return checkpoint, samples.latest_seq(connection, twin.key)
+
+
+def _dated(connection: sqlite3.Connection, twin: Entry, checkpoint: Checkpoint | None) -> Checkpoint | None:
+    """Return a checkpoint that knows what of the archive it had read; those of earlier releases do not say."""
+    if checkpoint is not None:
+        checkpoint.body.setdefault("seq", samples.latest_seq(connection, twin.key))
     return checkpoint
 
 
-def switch(connection: sqlite3.Connection, twin: Entry, version: int) -> Checkpoint | None:
-    """Let another version take over: end what was said by the others, return where it stands itself."""
-    row = connection.execute("SELECT last_us FROM head WHERE twin = ?", (twin.key,)).fetchone()
-    if row is not None and row[0] is not None:
-        anomalies.close_others(connection, twin.key, version, row[0])
-    return checkpoints.before(connection, twin.key, version)
+def look(
+    connection: sqlite3.Connection,
+    twin: Entry,
+    read: Sequence[tuple[int, int, int]],
+    told_seq: int,
+    most: int,
+    longest_gap_us: float,
+) -> Reading:
+    """Return at most ``most`` samples after what was read, and whether that has changed since.
 
-
-def next_samples(connection: sqlite3.Connection, twin: Entry, after_us: int | None, most: int) -> Samples:
-    """Return at most ``most`` samples after an instant."""
+    ``read`` are the stretches that were read, in order: (after, until] and the number at which the stream stood then.
+    ``told_seq`` is the number up to which samples count as told.
+    """
+    seq = samples.latest_seq(connection, twin.key)
+    late = [samples.arrived(connection, twin.key, number, after + 1, until + 1) for after, until, number in read]
+    first = _first_in_company(connection, twin.key, np.unique(np.concatenate([*late, _NONE])), longest_gap_us)
+    after_us = read[-1][1] if read else None
     stop_us = samples.block_stop(connection, twin.key, after_us, most)
     n = len(twin.channels)
-    start_us = None if after_us is None else after_us + 1
-    found = samples.select(connection, twin.key, n, range(n), start_us, stop_us)
-    return Samples(found.time_us[:most], found.values[:, :most])
+    found = samples.select(connection, twin.key, n, range(n), None if after_us is None else after_us + 1, stop_us)
+    fresh = Samples(found.time_us[:most], found.values[:, :most])
+    told = np.zeros(fresh.time_us.size, dtype=np.bool_)
+    if fresh.time_us.size:
+        span = (int(fresh.time_us[0]), int(fresh.time_us[-1]) + 1)
+        told = np.isin(fresh.time_us, samples.arrived(connection, twin.key, told_seq, *span))
+    return Reading(seq, first, fresh, told)
+
+
+def _first_in_company(
+    connection: sqlite3.Connection, twin: int, instants: NDArray[np.int64], longest_gap_us: float
+) -> int | None:
+    """Return the first instant with another sample no further than a long gap away; None if each stands alone.
+
+    What follows a long gap starts anew, so a sample between two of them changes nothing: most likely its clock is wrong.
+    """
+    reach = int(min(longest_gap_us, 2**61))
+    for instant in instants.tolist():
+        near = samples.arrived(connection, twin, -1, instant - reach, instant + reach + 1)
+        if (near != instant).any():
+            return int(instant)
+    return None

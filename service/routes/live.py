@@ -21,6 +21,7 @@ router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
 
 Start = Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")]
 Stop = Annotated[str | None, Query(description="First instant after the last one wanted.")]
+Version = Annotated[int | None, Query(ge=1, le=2**62, description="Of the model; absent: the active one.")]
 Seconds = Annotated[float, Query(gt=0, allow_inf_nan=False)]
 SecondsOrNone = Annotated[float | None, Query(gt=0, allow_inf_nan=False)]
 
@@ -62,7 +63,7 @@ async def list_residuals(
     twin: NamedTwin,
     start: Start = None,
     stop: Stop = None,
-    version: Annotated[int | None, Query(ge=1, le=2**62, description="Of the model; absent: the active one.")] = None,
+    version: Version = None,
     max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
 ) -> Response:
     """Return innovations, their predicted standard deviations and the NIS."""
@@ -99,7 +100,11 @@ def _render(twin: Entry, found: Found, count: int, max_points: int) -> bytes:
 
 
 @router.get("/anomalies", dependencies=[reads])
-async def list_anomalies(service: Running, twin: NamedTwin, start: Start = None, stop: Stop = None) -> AnomalyList:
+async def list_anomalies(
+    service: Running, twin: NamedTwin, start: Start = None, stop: Stop = None, version: Version = None
+) -> AnomalyList:
     """List the intervals in which a sensor did not behave as its model, the newest first."""
-    rows = await service.database.read(anomalies.select, twin.key, *span(start, stop))
+    if version is not None:
+        await service.database.read(models.get, twin.key, version)
+    rows = await service.database.read(anomalies.select, twin.key, *span(start, stop), version)
     return AnomalyList(anomalies=[Anomaly(**row.wire()) for row in rows])

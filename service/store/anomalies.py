@@ -2,7 +2,7 @@
 
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import orjson
@@ -51,53 +51,89 @@ class Change:
 _SELECT = "SELECT id, sensor, kind, start_us, stop_us, score, cause, version FROM anomaly "
 
 
-def apply(connection: sqlite3.Connection, twin: int, version: int, changes: Sequence[Change]) -> list[AnomalyRow]:
-    """Open, raise or close intervals; return those that changed."""
-    changed = []
-    for change in changes:
-        key = (twin, version, change.sensor, change.kind, change.start_us)
-        known = connection.execute(
-            "SELECT id FROM anomaly WHERE twin = ? AND version = ? AND sensor = ? AND kind = ? AND start_us = ?", key
-        ).fetchone()
+NOTICEABLE = 1.1
+"""A score is news when it has changed by this factor."""
+
+
+def apply(
+    connection: sqlite3.Connection, twin: int, version: int, changes: Sequence[Change], span_us: tuple[int, int]
+) -> list[AnomalyRow]:
+    """Write down what a detector says about the instants (after, until]; return the intervals that are news.
+
+    What was said about this time before, until a late sample came, is replaced: an interval that overlaps an earlier one
+    of its sensor and kind is the same anomaly and keeps number and cause; earlier ones that nothing confirms go.
+    """
+    news: list[int] = []
+    confirmed: set[int] = set()
+    for change in sorted(changes, key=lambda change: change.start_us):
+        known = _same(connection, twin, version, change, span_us[0], confirmed)
         if known is None:
             cursor = connection.execute(
                 """INSERT INTO anomaly (twin, version, sensor, kind, start_us, stop_us, score)
                    VALUES (?, ?, ?, ?, ?, ?, ?)""",
-                (*key, change.stop_us, change.score),
+                (twin, version, change.sensor, change.kind, change.start_us, change.stop_us, change.score),
             )
-            row = cursor.lastrowid
+            number = int(cursor.lastrowid or 0)
         else:
-            row = known[0]
-            update = "UPDATE anomaly SET stop_us = ?, score = max(score, ?) WHERE id = ?"
-            connection.execute(update, (change.stop_us, change.score, row))
-        changed.append(AnomalyRow(*connection.execute(_SELECT + "WHERE id = ?", (row,)).fetchone()))
-    return changed
-
-
-def rewind(connection: sqlite3.Connection, twin: int, version: int, after_us: int) -> None:
-    """Take back what was said about the time after an instant."""
-    connection.execute("DELETE FROM anomaly WHERE twin = ? AND version = ? AND start_us > ?", (twin, version, after_us))
+            number = known.id
+            confirmed.add(number)
+            ratio = max(change.score, 1e-9) / max(known.score, 1e-9)
+            same = (known.start_us, known.stop_us) == (change.start_us, change.stop_us)
+            if same and 1.0 / NOTICEABLE < ratio < NOTICEABLE:
+                continue
+            update = "UPDATE anomaly SET start_us = ?, stop_us = ?, score = ? WHERE id = ?"
+            connection.execute(update, (change.start_us, change.stop_us, change.score, number))
+        confirmed.add(number)
+        news.append(number)
+    kept = ",".join(map(str, confirmed))
     connection.execute(
-        "UPDATE anomaly SET stop_us = NULL WHERE twin = ? AND version = ? AND stop_us > ?", (twin, version, after_us)
+        f"""DELETE FROM anomaly WHERE twin = ? AND version = ? AND start_us > ? AND start_us <= ?
+            AND id NOT IN ({kept})""",
+        (twin, version, *span_us),
     )
+    return [
+        AnomalyRow(*connection.execute(_SELECT + "WHERE id = ?", (number,)).fetchone())
+        for number in dict.fromkeys(news)
+    ]
 
 
-def close_others(connection: sqlite3.Connection, twin: int, version: int, at_us: int) -> None:
-    """End the open intervals of models that are not active any more."""
-    connection.execute(
-        """UPDATE anomaly SET stop_us = max(start_us, ?) WHERE twin = ? AND version != ? AND stop_us IS NULL""",
-        (at_us, twin, version),
-    )
+def _same(
+    connection: sqlite3.Connection, twin: int, version: int, change: Change, after_us: int, taken: set[int]
+) -> AnomalyRow | None:
+    """Return the anomaly that a change goes on with: of the same start, or else said of a later time and overlapping."""
+    until_us = 2**62 if change.stop_us is None else change.stop_us
+    query = """WHERE twin = ? AND version = ? AND sensor = ? AND kind = ? AND (start_us = ? OR
+        (start_us > ? AND start_us <= ? AND (stop_us IS NULL OR stop_us >= ?))) ORDER BY start_us != ?, start_us"""
+    start = change.start_us
+    place = (twin, version, change.sensor, change.kind)
+    rows = connection.execute(_SELECT + query, (*place, start, after_us, until_us, start, start))
+    found = (AnomalyRow(*row) for row in rows)
+    return next((row for row in found if row.id not in taken or row.start_us == change.start_us), None)
 
 
 def select(
-    connection: sqlite3.Connection, twin: int, start_us: int | None = None, stop_us: int | None = None
+    connection: sqlite3.Connection,
+    twin: int,
+    start_us: int | None = None,
+    stop_us: int | None = None,
+    version: int | None = None,
 ) -> list[AnomalyRow]:
-    """Return the intervals that touch start <= time < stop, the newest first."""
+    """Return the intervals that touch start <= time < stop, the newest first: those of the active model, or of another.
+
+    What lasted when a model was last followed counts as ended there.
+    """
     start = start_us if start_us is not None else -(2**62)
     stop = stop_us if stop_us is not None else 2**62
-    query = _SELECT + "WHERE twin = ? AND start_us < ? AND (stop_us IS NULL OR stop_us >= ?) ORDER BY start_us DESC, id"
-    return [AnomalyRow(*row) for row in connection.execute(query, (twin, stop, start))]
+    row = connection.execute("SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1", (twin,))
+    active = next((number for (number,) in row), None)
+    chosen = active if version is None else version
+    query = _SELECT + "WHERE twin = ? AND version = ? AND start_us < ? ORDER BY start_us DESC, id"
+    rows = [AnomalyRow(*row) for row in connection.execute(query, (twin, chosen, stop))]
+    if chosen != active:
+        last = connection.execute("SELECT max(time_us) FROM checkpoint WHERE twin = ? AND version = ?", (twin, chosen))
+        end = last.fetchone()[0]
+        rows = [replace(r, stop_us=max(r.start_us, end or 0)) if r.stop_us is None else r for r in rows]
+    return [row for row in rows if row.stop_us is None or row.stop_us >= start]
 
 
 def explain(connection: sqlite3.Connection, twin: int, sensors: Sequence[str], cause: dict[str, Any]) -> None:

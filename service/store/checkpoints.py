@@ -21,13 +21,15 @@ class Checkpoint:
     body: dict[str, Any]
 
 
-def put(connection: sqlite3.Connection, twin: int, version: int, checkpoint: Checkpoint) -> None:
+def put(
+    connection: sqlite3.Connection, twin: int, version: int, checkpoint: Checkpoint, *, keep_previous: bool = False
+) -> None:
     """Store a checkpoint, and forget the previous one unless it is worth keeping."""
     rows = connection.execute(
         "SELECT time_us, n FROM checkpoint WHERE twin = ? AND version = ? ORDER BY time_us DESC LIMIT 2",
         (twin, version),
     ).fetchall()
-    if len(rows) == 2 and checkpoint.n_samples - rows[1][1] < EVERY:
+    if not keep_previous and len(rows) == 2 and checkpoint.n_samples - rows[1][1] < EVERY:
         _delete(connection, twin, version, [rows[0][0]])
     connection.execute(
         "INSERT OR REPLACE INTO checkpoint (twin, version, time_us, n, state) VALUES (?, ?, ?, ?, ?)",

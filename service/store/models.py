@@ -9,6 +9,7 @@ import orjson
 
 from service.instants import format_instant, now_us, parse_instant
 from service.problems import BadField
+from twin_core.telemetry import GAP_STEPS
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,11 @@ class Active:
     def parsed_step_s(self) -> float:
         """Longest time step of its rollouts."""
         return float(self.parsed()["max_step_s"])
+
+    @property
+    def longest_gap_us(self) -> float:
+        """Beyond a longer interval the assimilation starts anew."""
+        return 1e6 * GAP_STEPS * self.parsed_step_s
 
     def parsed(self) -> dict[str, Any]:
         """Return the document as data."""

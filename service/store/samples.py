@@ -270,6 +270,26 @@ def overview(
     return found, int(found.time_us.size) + left_out
 
 
+def latest_seq(connection: sqlite3.Connection, twin: int) -> int:
+    """Return the last number of a twin's stream: every sample of a smaller one is in the archive."""
+    row = connection.execute("SELECT seq FROM head WHERE twin = ?", (twin,)).fetchone()
+    if row is None:
+        raise TwinGone(f"twin {twin} is gone")
+    return int(row[0])
+
+
+def arrived(
+    connection: sqlite3.Connection, twin: int, after_seq: int, start_us: int, stop_us: int
+) -> NDArray[np.int64]:
+    """Return the instants, start <= time < stop, of samples that came after one stream number, in any order."""
+    found = [np.empty(0, dtype=np.int64)]
+    query = "SELECT seq, time FROM chunk WHERE twin = ? AND last_seq > ? AND last_us >= ? AND first_us < ?"
+    for seq, time in connection.execute(query, (twin, after_seq, start_us, stop_us)):
+        instants = np.frombuffer(time, dtype="<i8")[np.frombuffer(seq, dtype="<i8") > after_seq]
+        found.append(instants[(instants >= start_us) & (instants < stop_us)])
+    return np.concatenate(found)
+
+
 def since_seq(
     connection: sqlite3.Connection, twin: int, n_channels: int, after_seq: int
 ) -> tuple[NDArray[np.int64], Samples]:

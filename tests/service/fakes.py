@@ -22,6 +22,8 @@ from twin_core.errors import ModelError
 SENSORS = ("T_px", "T_tank")
 UNFIT = 666.0
 """A reading that the fake filter cannot assimilate."""
+DEADLY = 667.0
+"""A reading over which the process of the fake filter dies."""
 
 
 class FakeWorkbench:
@@ -71,6 +73,8 @@ class FakeWorkbench:
         if "poison" in document and not Path(document[document.index("/") :].split('"')[0]).exists():
             os.kill(os.getpid(), 9)
         read = np.stack([telemetry.values[s] for s in SENSORS], axis=1)
+        if (read == DEADLY).any():
+            os.kill(os.getpid(), 9)
         if (read == UNFIT).any():
             raise ModelError("the filter cannot make sense of a reading")
         before = np.array(state["last"]) if state else read[0]

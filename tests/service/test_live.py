@@ -1,12 +1,16 @@
 """The live state: residuals, anomalies and forecasts after each sample, late ones included."""
 
+import json
+import sqlite3
 import time
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.service.conftest import SPEC
-from tests.service.fakes import UNFIT, FakeWorkbench
+from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
 from tests.service.harness import AppClient
 
 TWIN = "/v1/twins/benchsat"
@@ -223,3 +227,138 @@ def test_a_diagnosis_names_the_cause(client: AppClient) -> None:
     (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
     assert anomaly["cause"]["effect"] == "constant_heat_load"
     assert anomaly["cause"]["where"] == {"node": "px"}
+
+
+def counted(client: AppClient, name: str) -> float:
+    lines = client.get("/metrics").text.splitlines()
+    return float(next(line for line in lines if line.startswith(f"{name} ")).split()[1])
+
+
+DAYS = 86_400.0
+LATER = 5000 * DAYS
+
+
+@pytest.mark.parametrize("wrong", ["2190-01-01T00:00:00Z", 5])
+def test_a_sample_of_a_wrong_clock_moves_nothing(client: AppClient, wrong: str | float) -> None:
+    send(client, [LATER + k for k in range(100)], [SCALE_K * k * k for k in range(100)])
+    calibrate(client)
+    residuals(client)
+    send(client, [wrong], [290.0])
+    send(client, [LATER + 100], [SCALE_K * 10_000])
+    assert list(residuals(client).values())[-1] == SCALE_K * 199
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+    assert found["from"] == "1983-09-10T00:01:40Z"
+    assert counted(client, "twin_assimilated_samples_total") == 101  # nothing was filtered twice
+
+
+def test_after_a_long_gap_the_second_sample_brings_the_first(client: AppClient) -> None:
+    squares(client)
+    send(client, [LATER], [290.0])
+    assert len(residuals(client)) == 100
+    send(client, [LATER + 1], [291.0])
+    found = residuals(client)
+    assert len(found) == 102 and found["1983-09-10T00:00:01Z"] == 1.0
+    send(client, [100, 101], [SCALE_K * 100**2, SCALE_K * 101**2])  # of before the gap: little is done again
+    found = residuals(client)
+    assert len(found) == 104 and found["1970-01-01T00:01:41Z"] == SCALE_K * 201
+    assert counted(client, "twin_assimilated_samples_total") == 106
+
+
+def test_a_sample_that_kills_the_worker_is_skipped(client: AppClient) -> None:
+    squares(client)
+    send(client, [100], [DEADLY])
+    assert len(residuals(client)) == 100
+    send(client, [101], [SCALE_K * 101**2])
+    found = residuals(client)
+    assert list(found)[-1] == "1970-01-01T00:01:41Z" and len(found) == 101
+    assert counted(client, "twin_skipped_samples_total") == 1
+
+
+def test_samples_in_order_are_never_taken_for_late_ones(client: AppClient) -> None:
+    squares(client)
+    for k in range(100, 400):
+        send(client, [k], [SCALE_K * 100])
+    assert len(residuals(client)) == 400
+    assert counted(client, "twin_assimilated_samples_total") == 400
+
+
+def test_a_late_sample_that_was_stored_before_a_crash_is_assimilated_after_it(make_client) -> None:
+    first = make_client(workbench=FakeWorkbench)
+    first.post("/v1/twins", json=SPEC)
+    squares(first)
+    send(first, [102], [SCALE_K * 102**2])
+    residuals(first)
+    first.close()
+    deaf = make_client(workbench=FakeWorkbench, assimilate=False)
+    send(deaf, [101], [SCALE_K * 101**2])
+    deaf.close()
+    again = make_client(workbench=FakeWorkbench)
+    assert list(residuals(again).values())[-1] == SCALE_K * (102**2 - 101**2)
+
+
+def lasting(client: AppClient, stop: int = 130) -> dict:
+    """Return the one anomaly of a sensor that begins to jump at 100 s."""
+    send(client, list(range(100)), [0.0] * 100)
+    calibrate(client)
+    send(client, list(range(100, stop)), [40.0 * (k % 2) for k in range(100, stop)])
+    residuals(client)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    return anomaly
+
+
+def test_an_anomaly_outlives_a_late_sample_with_number_and_cause(client: AppClient) -> None:
+    before = lasting(client)
+    path = client.post(f"{TWIN}/diagnoses").headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    send(client, [50.5], [0.0])
+    residuals(client)
+    (after,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert (after["id"], after["start"], after["stop"]) == (before["id"], before["start"], None)
+    assert after["cause"]["effect"] == "constant_heat_load"
+
+
+def test_an_anomaly_that_a_late_sample_refutes_is_gone(client: AppClient) -> None:
+    send(client, list(range(100)), [0.0] * 100)
+    calibrate(client)
+    send(client, [100, 101, 102], [0.0, 0.0, 60.0])
+    residuals(client)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert anomaly["start"] == "1970-01-01T00:01:42Z"
+    send(client, [101.5], [60.0])
+    residuals(client)
+    (moved,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert moved["start"] == "1970-01-01T00:01:41.500000Z"
+
+
+def test_an_anomaly_is_told_when_it_opens_grows_or_closes_and_not_with_every_sample(
+    client: AppClient, tmp_path: Path
+) -> None:
+    lasting(client)
+    for k in range(130, 200):
+        send(client, [k], [40.0 * (k % 2)])
+        residuals(client)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    send(client, list(range(200, 500)), [0.0] * 300)
+    residuals(client)
+    with sqlite3.connect(tmp_path / "twin.sqlite3") as database:
+        bodies = [row[0] for row in database.execute("SELECT body FROM event WHERE type = 'anomaly' ORDER BY seq")]
+    told = [json.loads(body)["anomaly"] for body in bodies]
+    assert {row["id"] for row in told} == {anomaly["id"]}
+    assert told[-1]["stop"] is not None and [row["stop"] for row in told[:-1]] == [None] * (len(told) - 1)
+    scores = [row["score"] for row in told[:-1]]
+    assert all(after >= 1.1 * before for before, after in pairwise(scores))  # each of them is news
+
+
+def test_a_rollback_finds_its_anomalies_as_they_were(client: AppClient) -> None:
+    before = lasting(client)
+    calibrate(client)
+    residuals(client)
+    (other,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert (other["model_version"], other["start"]) == (2, before["start"])
+    (past,) = client.get(f"{TWIN}/anomalies", params={"version": 1}).json()["anomalies"]
+    assert past == before | {"stop": "1970-01-01T00:02:09Z"}
+    client.post(f"{TWIN}/models/1/activate")
+    residuals(client)
+    assert client.get(f"{TWIN}/anomalies").json()["anomalies"] == [before]
+    assert client.get(f"{TWIN}/anomalies", params={"version": 9}).status_code == 404

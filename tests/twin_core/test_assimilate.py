@@ -225,3 +225,46 @@ def test_one_sample_is_enough() -> None:
 def test_a_silent_sensor_is_no_obstacle() -> None:
     found = assimilate(chain_model(), record_of(60.0 * np.arange(20), Q=0.0, T0=280.0))
     assert np.isnan(found.innovation_K[:, 1]).all()
+
+
+def jumped(gap_s: float) -> Record:
+    """Return a record with one interval of ``gap_s`` in its middle; its input is silent right after it."""
+    record = chain_record()
+    time_s = record.time_s.copy()
+    time_s[60:] += gap_s
+    values = {name: column.copy() for name, column in record.values.items()}
+    values["Q"][60:] = np.nan
+    return Record(time_s, values, record.epoch_ns, "jumped")
+
+
+@pytest.mark.parametrize("gap_s", [6.1e5, 5.2e9])
+def test_after_a_long_gap_the_filter_starts_anew(gap_s: float) -> None:
+    model, record = chain_model(max_step_s=60.0), jumped(gap_s)
+    whole = assimilate(model, record)
+    later = record.take(np.arange(60, 120))
+    held = np.full(60, record.values["Q"][59])
+    alone = assimilate(model, Record(later.time_s, {**later.values, "Q": held}, record.epoch_ns, "later"))
+    np.testing.assert_array_equal(whole.innovation_K[60:], alone.innovation_K)
+    np.testing.assert_array_equal(whole.mean_K, alone.mean_K)
+    np.testing.assert_array_equal(whole.covariance_K2, alone.covariance_K2)
+    resumed = assimilate(model, record.take(np.arange(59, 120)), assimilate(model, record.take(np.arange(60))).state)
+    np.testing.assert_array_equal(resumed.innovation_K[1:], alone.innovation_K)
+
+
+def test_after_a_long_gap_without_readings_the_state_is_kept_but_not_trusted() -> None:
+    model, record = chain_model(max_step_s=60.0), chain_record()
+    state = assimilate(model, record).state
+    silent = record_of(np.array([record.time_s[-1], 5.2e9]), Q=[0.0, 0.0], T0=[np.nan] * 2, T2=[np.nan] * 2)
+    done = assimilate(model, silent, state)
+    np.testing.assert_array_equal(done.mean_K, state["mean_K"])
+    np.testing.assert_array_equal(done.covariance_K2, START_STD_HIDDEN_K**2 * np.eye(3))
+
+
+def test_many_steps_are_filtered_in_pieces_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, record = chain_model(max_step_s=20.0), chain_record()
+    whole = assimilate(model, record)
+    monkeypatch.setattr("twin_core.assimilate.MOST_STEPS", 50)
+    pieces = assimilate(model, record)
+    np.testing.assert_allclose(pieces.innovation_K, whole.innovation_K, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(pieces.nis, whole.nis, rtol=1e-9)
+    np.testing.assert_allclose(pieces.covariance_K2, whole.covariance_K2, rtol=1e-9)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twin_core.errors import TelemetryError
-from twin_core.telemetry import Record
+from twin_core.telemetry import Record, cut_at_gaps
 
 EPOCH_NS = 1_767_225_600_000_000_000
 
@@ -65,3 +65,24 @@ def test_an_instant_is_one_number_in_every_dated_record() -> None:
     np.testing.assert_array_equal(early.clock_s, [1_767_312_000.0, 1_767_312_600.0])
     np.testing.assert_array_equal(early.clock_s, late.clock_s)
     np.testing.assert_array_equal(Record(np.array([5.0, 6.0]), {}).clock_s, [5.0, 6.0])
+
+
+def test_a_record_is_cut_at_long_gaps_and_inputs_hold_across_them() -> None:
+    time_s = np.array([0.0, 1.0, 2.0, 50.0, 51.0, 200.0])
+    values = {"Q": np.array([5.0, 7.0, np.nan, np.nan, 8.0, np.nan]), "T": np.full(6, np.nan)}
+    record = Record(time_s, values, None, "day.csv")
+    assert record.parts(148.999, {"Q"})[0].time_s.tolist() == time_s[:5].tolist()
+    assert record.parts(149.0, {"Q"}) == [record]
+    parts = record.parts(40.0, {"Q"})
+    assert [part.time_s.tolist() for part in parts] == [[0.0, 1.0, 2.0], [50.0, 51.0], [200.0]]
+    np.testing.assert_array_equal(np.concatenate([part.values["Q"] for part in parts]), [5, 7, np.nan, 7, 8, 8])
+    assert all(np.isnan(part.values["T"]).all() for part in parts)
+    assert np.isnan(values["Q"][3])  # the record itself stays as it is
+
+
+def test_scraps_between_gaps_are_left_out_where_there_is_more() -> None:
+    long, scrap = np.arange(30.0), np.array([1e9])
+    assert [r.time_s.size for r in cut_at_gaps([record([*long, *scrap, *(2e9 + long)])], set())] == [30, 30]
+    assert [r.time_s.size for r in cut_at_gaps([record([0.0, 1.0, 2.0, *scrap])], set())] == [3]
+    untouched = [record([*long]), record([5.0])]
+    assert cut_at_gaps(untouched, set()) == untouched

@@ -9,7 +9,7 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
 from twin_core.network.spec import TwinSpec
-from twin_core.telemetry import Record
+from twin_core.telemetry import Record, cut_at_gaps
 
 METHODS = ("second-order", "neural-ode")
 LOSSES = ("squared", "huber")
@@ -30,7 +30,7 @@ def calibrate(
     spec
         The declared network: guesses, bounds, known values.
     records
-        Segments of telemetry in SI, each with its own initial state.
+        Segments of telemetry in SI, each with its own initial state; a long gap divides a segment.
     method
         ``second-order``: Levenberg-Marquardt with exact sensitivities. ``neural-ode``: the method of paper A
         (arXiv 2605.28452), Adam on windows of the record; it states no uncertainty of the parameters.
@@ -53,6 +53,7 @@ def calibrate(
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
     if loss not in LOSSES:
         raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
+    records = cut_at_gaps(records, spec.driving_channels)
     from twin_core.calibrate.second_order import fit_trajectories, to_model
 
     if method == "neural-ode":

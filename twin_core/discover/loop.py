@@ -21,7 +21,7 @@ from twin_core.discover.search import search
 from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
-from twin_core.telemetry import Record
+from twin_core.telemetry import Record, cut_at_gaps
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,10 @@ def _split(
     """Return the training records and the hold-out; TelemetryError where there is nothing to score."""
     if not records:
         raise TelemetryError("no telemetry given")
+    records = cut_at_gaps(records, spec.driving_channels)
     if holdout_records:
-        train, held = list(records), [split_burn_in(record, burn_in_s) for record in holdout_records]
+        separate = cut_at_gaps(holdout_records, spec.driving_channels)
+        train, held = list(records), [split_burn_in(record, burn_in_s) for record in separate]
     else:
         train, held = split_fraction(records, 0.3 if holdout is None else holdout)
     if not any(np.isfinite(measured_temperatures(spec, h.scored)[1:]).any() for h in held):

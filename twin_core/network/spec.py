@@ -314,6 +314,11 @@ class TwinSpec(_Strict):
         used |= {name for name, channel in self.channels.items() if channel.kind != "temperature"}
         return tuple(name for name in self.channels if name in used)
 
+    @property
+    def driving_channels(self) -> frozenset[str]:
+        """The used channels that no sensor reads: inputs and boundary temperatures."""
+        return frozenset(self.used_channels) - frozenset(self.sensors)
+
     def noise_std_K(self, sensor: str) -> float | None:
         """The declared noise of a sensor in kelvin (a difference: the same number in degC)."""
         return self.channels[sensor].noise_std

@@ -199,6 +199,17 @@ def test_gaps_and_irregular_samples_are_no_obstacle() -> None:
     assert max(abs(z) for z in scores(model, TRUTH).values()) < 4.0
 
 
+def test_a_gap_of_a_century_divides_the_record_and_a_scrap_beyond_it_is_left_out() -> None:
+    record, century_s = telemetry(), 3.2e9
+    time_s = (
+        record.time_s + np.where(np.arange(300) >= 150, century_s, 0.0) + np.where(np.arange(300) >= 297, century_s, 0)
+    )
+    halves = [record.take(np.arange(150)), Record(time_s[150:297], record.take(np.arange(150, 297)).values)]
+    whole = calibrate(load_spec(declared()), [Record(time_s, record.values)])
+    apart = calibrate(load_spec(declared()), halves)
+    assert whole.values == apart.values
+
+
 def test_excluded_intervals_take_no_part() -> None:
     """Readings within an excluded interval may be anything: the result is that of leaving them out."""
     data = declared()
