@@ -55,8 +55,9 @@ class TwinInfo(_Answer):
 
 
 class TwinDetail(TwinInfo):
-    """A registered twin with its specification."""
+    """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found."""
 
+    catching_up: bool
     specification: dict[str, Any]
 
 

@@ -44,6 +44,10 @@ class Live:
             )
         return tracker
 
+    def catching_up(self, twin: str) -> bool:
+        """Return whether many samples of a twin, or those before its model became active, are still to be assimilated."""
+        return any(tracker.catching_up for tracker in self._trackers.values() if tracker.twin.name == twin)
+
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""
         tracker = self._trackers.get(twin.key)

@@ -71,6 +71,7 @@ class Tracker:
         self.active: Active | None = None
         self.position: Position | None = None
         self.trouble: str | None = None
+        self.catching_up = False
         self._database, self._hub, self._engine = database, hub, engine
         self._metrics, self._thresholds = metrics, thresholds
         self._caution = _Caution()
@@ -132,12 +133,12 @@ class Tracker:
         self._new_model = False
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
-            self.active, self.position = None, None
+            self.active, self.position, self.catching_up = None, None, False
             return
         if self.active is not None and self.active.version == active.version:
             return
         checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
-        self._caution, self.trouble = _Caution(), None
+        self._caution, self.trouble, self.catching_up = _Caution(), None, True
         self.position = None if checkpoint is None else Position.of(checkpoint)
         self.active = active
 
@@ -158,8 +159,9 @@ class Tracker:
             return True
         count = next_count(reading.fresh.time_us, before, active.longest_gap_us)
         if count == 0:
-            self._told_seq = reading.seq
+            self._told_seq, self.catching_up = reading.seq, False
             return False
+        self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
         telemetry, held = stretch(self.twin, fresh, active.epoch_us, before)

@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Response
 
-from service.deps import NamedTwin, Running, operates, reads
+from service.deps import NamedTwin, Running, Service, operates, reads
 from service.instants import format_instant
 from service.schemas import TwinDetail, TwinInfo, TwinList
 from service.store import twins
@@ -31,8 +31,9 @@ def _info(twin: Twin) -> dict[str, Any]:
     }
 
 
-def _detail(twin: Twin) -> TwinDetail:
-    return TwinDetail(**_info(twin), specification=twin.specification)
+def _detail(service: Service, twin: Twin) -> TwinDetail:
+    behind = service.live.catching_up(twin.name)
+    return TwinDetail(**_info(twin), catching_up=behind, specification=twin.specification)
 
 
 @router.post("", status_code=201, dependencies=[operates])
@@ -42,7 +43,7 @@ async def register(service: Running, response: Response, body: Annotated[dict[st
     twin, is_new = await service.register(spec.twin, dump_spec(spec))
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
-    return _detail(twin)
+    return _detail(service, twin)
 
 
 @router.get("", dependencies=[reads])
@@ -54,7 +55,7 @@ async def list_twins(service: Running) -> TwinList:
 @router.get("/{twin}", dependencies=[reads])
 async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
     """Return one twin with its specification."""
-    return _detail(await service.database.read(twins.get, twin.name))
+    return _detail(service, await service.database.read(twins.get, twin.name))
 
 
 @router.delete("/{twin}", status_code=204, dependencies=[operates])

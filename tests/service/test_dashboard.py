@@ -53,6 +53,7 @@ def test_a_day_at_the_console(server: Server, page: Browser) -> None:
     page.until("document.querySelector('#residuals canvas')")
     page.until("document.getElementById('now-note').innerText.includes('expected in')")
     page.until("document.getElementById('anomalies').innerText.includes('T_px')")
+    page.until("!document.querySelector('#now .state.unknown')")
     assert page.evaluate("document.querySelectorAll('#now .state.unknown').length") == 0
     assert "17.05" in page.text("#now")  # 290.2 K, shown in the unit of the other sensor
     assert page.evaluate("document.querySelectorAll('#network circle.node').length") == 1

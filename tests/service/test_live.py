@@ -1,6 +1,7 @@
 """The live state: residuals, anomalies and forecasts after each sample, late ones included."""
 
 import json
+import os
 import sqlite3
 import time
 from itertools import pairwise
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.workbench import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
 from tests.service.harness import AppClient
@@ -362,3 +364,27 @@ def test_a_rollback_finds_its_anomalies_as_they_were(client: AppClient) -> None:
     residuals(client)
     assert client.get(f"{TWIN}/anomalies").json()["anomalies"] == [before]
     assert client.get(f"{TWIN}/anomalies", params={"version": 9}).status_code == 404
+
+
+class Gated(FakeWorkbench):
+    """Assimilates once a file is there."""
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        while not Path(os.environ["FAKE_GATE"]).exists():
+            time.sleep(0.02)
+        return super().assimilate(document, telemetry, state)
+
+
+def test_a_twin_says_while_it_catches_up(make_client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FAKE_GATE", str(tmp_path / "gate"))
+    client = make_client(workbench=Gated)
+    assert client.post("/v1/twins", json=SPEC).json()["catching_up"] is False
+    send(client, list(range(100)), [290.0] * 100)
+    calibrate(client)
+    while client.get(TWIN).json()["catching_up"] is not True:
+        time.sleep(0.02)
+    (tmp_path / "gate").touch()
+    assert len(residuals(client)) == 100
+    assert client.get(TWIN).json()["catching_up"] is False
+    send(client, [100], [290.0])
+    assert client.get(TWIN).json()["catching_up"] is False  # one sample is nothing to catch up with

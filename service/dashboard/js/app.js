@@ -9,10 +9,11 @@ const $ = (id) => document.getElementById(id);
 const RANGES = [["1 h", 3600], ["6 h", 21600], ["1 d", 86400], ["7 d", 604800], ["all", Infinity]];
 const POINTS = 1500;
 const LEAST_PAUSE_MS = 700;
+const CATCH_UP_MS = 1000;  // what is assimilated in arrears is not told one by one
 
 const state = {
   twin: null, detail: null, range_s: 86400, zoom: null, unit: null, kind: "residual", hidden: new Set(),
-  latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null,
+  latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null,
 };
 let zoomTo = () => {};
 const temperatures = new TemperatureChart($("temperatures"), (ends) => zoomTo(ends));
@@ -89,7 +90,10 @@ async function load(parts) {
   }
   if (parts.has("anomalies")) state.anomalies = (await call(`${path}/anomalies`)).anomalies;
   if (parts.has("plots") && state.detail.last_time) await loadPlots(path);
-  if (state.twin === twin) render(parts);
+  if (state.twin !== twin) return;
+  render(parts);
+  clearTimeout(state.again);
+  if (state.detail.catching_up) state.again = setTimeout(() => refresh("plots", "anomalies"), CATCH_UP_MS);
 }
 
 async function loadPlots(path) {
@@ -129,10 +133,11 @@ function drawFacts() {
 }
 
 function renderPlots() {
-  const list = sensors(), unit = unitShown(), from = units(), hasModel = state.detail.active_model !== null;
+  const list = sensors(), unit = unitShown(), from = units();
+  const standing = state.detail.active_model === null ? "no model is active" : state.detail.catching_up ? "catching up" : "";
   $("unit").textContent = unitName(unit);
   renderLegend(list);
-  drawAnomalies($("anomalies"), state.anomalies, list, hasModel, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
+  drawAnomalies($("anomalies"), state.anomalies, list, standing, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
   const open = state.anomalies.filter((a) => a.stop === null).length;
   $("anomaly-note").textContent = open ? `${open} open` : "";
   if (!state.archive || !state.detail.last_time) {
@@ -142,7 +147,7 @@ function renderPlots() {
     renderTemperatures(list, unit, from);
     renderResiduals(list);
   }
-  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, hasModel });
+  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, standing });
   $("now-note").textContent = state.ahead ? `${unitName(unit)}, expected in ${span(seconds(state.ahead.time.at(-1)) - seconds(state.ahead.from))}` : unitName(unit);
   renderNetwork(unit, from);
 }

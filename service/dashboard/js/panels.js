@@ -3,10 +3,10 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, hasModel }) {
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, standing }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
   const show = (value, from) => number(toUnit(value, from, unit), 2);
-  const look = (name) => (!hasModel ? ["state unknown", "no model is active"] : open.has(name) ? ["state bad", "anomaly"] : ["state", "as expected"]);
+  const look = (name) => (open.has(name) ? ["state bad", "anomaly"] : standing ? ["state unknown", standing] : ["state", "as expected"]);
   const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
   const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {
@@ -27,8 +27,15 @@ const KINDS = {
   joint: "together depart from the model",
 };
 
-export function drawAnomalies(list, anomalies, sensors, hasModel, onPick) {
-  if (!anomalies.length) return list.replaceChildren(quiet(hasModel ? "Every sensor behaves as its model says." : "No model is active yet to compare the sensors with."));
+// What no anomaly means, by how the twin stands.
+const QUIET = {
+  "": "Every sensor behaves as its model says.",
+  "no model is active": "No model is active yet to compare the sensors with.",
+  "catching up": "Catching up: the archive is still being compared with the model.",
+};
+
+export function drawAnomalies(list, anomalies, sensors, standing, onPick) {
+  if (!anomalies.length) return list.replaceChildren(quiet(QUIET[standing]));
   list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
     const index = sensors.findIndex((s) => s.name === anomaly.sensor);
     const open = anomaly.stop === null, start = seconds(anomaly.start);
