@@ -3,12 +3,14 @@ and the declared quantities must be left where they may be."""
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from twin_core.discover.confirm import Trial, try_effects, weigh
-from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, screened, shortlist
+from twin_core.discover.shortlist import LATENT_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.parameters.transforms import Log
 
-N_REFITS = 3
+N_REFITS = 6
 FAR_STD = 3.0
 """A declared guess counts as left behind beyond so many standard deviations of its prior: a factor of twenty."""
 
@@ -50,11 +52,14 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
     """
     layout = trial.fit.network.layout
     nodes = {node for effect in effects for node in touched_nodes(effect, layout)}
-    rankings = [
-        best_of_each_place([p for p in screening.probes if p.effect.where["node"] in nodes], trial.n_samples)
-        for screening in screened(trial, trial.fit, LATENT_SHARES, fallback=True)
-    ]
-    n_tried = max(map(len, rankings))
-    free = shortlist(rankings, needed, N_REFITS)
+    n_tried, best = 1, dict[object, tuple[float, Effect]]()
+    for screening in screened(trial, trial.fit, LATENT_SHARES, fallback=True):
+        probes = [probe for probe in screening.probes if probe.effect.where["node"] in nodes]
+        n_tried = max(n_tried, len({probe.effect.place for probe in probes}))
+        for probe in probes:
+            worth, form = schwarz_gain(probe, trial.n_samples), (probe.effect.place, len(probe.effect.amplitudes))
+            if probe.gain > needed and worth > best.get(form, (-np.inf, probe.effect))[0]:
+                best[form] = worth, probe.effect
+    free = [effect for _, effect in sorted(best.values(), key=lambda item: -item[0])[:N_REFITS]]
     tops = (try_effects(trial, (*trial.effects, effect), n_passes=10) for effect in free)
     return any(weigh(trial, top, n_tried).log_bayes_factor > needed for top in tops)

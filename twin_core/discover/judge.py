@@ -113,7 +113,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             continue
         validation = validate(state.trial, best.trial)
         own = replace(best, validation=validation)
-        if is_valid(validation, own.effects) and is_told(own) and _is_sound(state.trial, own, needed):
+        if is_valid(validation, own.effects) and is_told(own) and not leaves_declaration(state.trial, own.trial):
+            if _merely_resembles(own, needed):
+                state.rejected.append(own)  # what explains less is no better a name for this heat
+                break
             elsewhere = [j for j in judged if _places(j) != _places(best) and j not in failed]
             close = [j for j in elsewhere if is_close(j, best)]
             state.trial = best.trial
@@ -125,12 +128,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def _is_sound(simple: Trial, judged: Judged, needed: float) -> bool:
-    """Return whether effects leave the declaration standing, and are a law that holds or make no claim to be one."""
-    if leaves_declaration(simple, judged.trial):
-        return False
+def _merely_resembles(judged: Judged, needed: float) -> bool:
+    """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
     named = [effect for effect in judged.effects if not effect.fallback]
-    return not named or not leaves_a_repeatable_heat(judged.trial, named, needed)
+    return bool(named) and leaves_a_repeatable_heat(judged.trial, named, needed)
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

@@ -73,12 +73,16 @@ def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
     return list({_start(e): e for e in (best.get(effect.place, effect) for effect in effects)}.values())
 
 
+def schwarz_gain(probe: Probe, n_samples: int) -> float:
+    """Return a probe's gain with each amplitude paid for."""
+    return probe.gain - 0.5 * float(np.log(max(n_samples, 2))) * len(probe.effect.amplitudes)
+
+
 def best_of_each_place(probes: Sequence[Probe], n_samples: int) -> list[Probe]:
     """Return the best setting of each effect and place, best first, each amplitude paid for by its Schwarz penalty."""
-    penalty = 0.5 * np.log(max(n_samples, 2))
     best: dict[object, tuple[float, Probe]] = {}
     for probe in probes:
-        worth = probe.gain - penalty * len(probe.effect.amplitudes)
+        worth = schwarz_gain(probe, n_samples)
         if probe.effect.place not in best or worth > best[probe.effect.place][0]:
             best[probe.effect.place] = (worth, probe)
     return [probe for _, probe in sorted(best.values(), key=lambda item: -item[0])]
