@@ -32,7 +32,12 @@ def _not_boolean(value: Any) -> Any:
 
 Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
 Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
-Magnitude = Annotated[float, BeforeValidator(_not_boolean), Field(ge=1e-12, le=1e15, allow_inf_nan=False)]
+Magnitude = Annotated[
+    float,
+    BeforeValidator(_not_boolean),
+    Field(gt=0, allow_inf_nan=False),
+    Field(ge=1e-12, le=1e15, allow_inf_nan=False),
+]
 """A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
 Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
 Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
