@@ -57,7 +57,7 @@ class TwinInfo(_Answer):
 class TwinDetail(TwinInfo):
     """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found."""
 
-    catching_up: bool
+    catching_up: bool = False
     specification: dict[str, Any]
 
 

@@ -27,18 +27,14 @@ BETWEEN_SESSIONS = 0.5
 """Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to, or it is the sessions
 that differ."""
 
-LUMPING_SHARE, LUMPING_SHARE_EXPLAINED = 0.005, 0.002
-"""What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge. Lumping
-leaves misfit of its own behind, so an effect that explains nearly all may be smaller."""
+LUMPING_SHARE = 0.005
+"""What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
 
 UNEXPLAINED_SHARE = 1.0
 """Misfit over noise beyond which a record without a supported effect is called unexplained."""
 
 UNTOLD_STD = 1.0
 """Relative deviation beyond which a quantity is not told: a mass of any size is a boundary, not a mass."""
-
-NEARLY_ALL = 0.95
-"""Share of the latent heat's variance from which an effect counts as explaining what is there."""
 
 EXPLAINED_SHARE, EXPLAINED_SHARE_TOGETHER = 0.6, 0.85
 """An effect must make this much of the latent heat's variance superfluous where it acts, several at once almost all of it,
@@ -178,8 +174,7 @@ def is_valid(validation: Validation, effects: Sequence[Effect]) -> bool:
         either = False
     is_single = len(effects) == 1
     share = EXPLAINED_SHARE if is_single or max(blocks, forward) < HALVED else EXPLAINED_SHARE_TOGETHER
-    least = LUMPING_SHARE_EXPLAINED if validation.explained_share > NEARLY_ALL else LUMPING_SHARE
-    matters = validation.removed_share > least and validation.explained_share > share
+    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > share
     return (both or (either and is_single and not effects[0].fallback)) and matters
 
 
