@@ -33,7 +33,7 @@ def demo(out: Path, serve: bool, effect: str, seed: int, as_json: bool) -> int:
     if out.exists() and not out.is_dir():
         raise click.UsageError(f"--out {out} is a file; name a folder")
     try:
-        with _terminable(), run_demo(effect, seed, out) as outcome:
+        with _terminable() as asked, run_demo(effect, seed, out) as outcome:
             if as_json:
                 print_line(to_json(outcome.to_json()).rstrip())
             else:
@@ -41,6 +41,7 @@ def demo(out: Path, serve: bool, effect: str, seed: int, as_json: bool) -> int:
             if serve:
                 print_line(f"dashboard: {outcome.url} (Ctrl-C ends it)")
                 _wait()
+                asked.clear()
     except StepFailed as error:
         click.echo(f"twin: {error}", err=True)
         return 1
@@ -48,20 +49,29 @@ def demo(out: Path, serve: bool, effect: str, seed: int, as_json: bool) -> int:
 
 
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM end the block as Ctrl-C does, so that everything started is cleaned up."""
+def _terminable() -> Iterator[list[int]]:
+    """Let SIGTERM end the block as Ctrl-C does, so that everything started is cleaned up; yield the signals heard.
+
+    A library may lose the interruption (one that arrives in a finaliser is only printed): the end of the block heeds it.
+    """
+    asked: list[int] = []
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        asked.append(number)
         raise KeyboardInterrupt
 
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield asked
         return
-    before = signal.signal(signal.SIGTERM, interrupt)
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, interrupt) for number in numbers]
     try:
-        yield
+        yield asked
+        if asked:
+            raise KeyboardInterrupt
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
 
 
 def _wait() -> None:
