@@ -5,13 +5,13 @@ import logging
 from collections.abc import AsyncIterator
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 
 from service import problems
 from service.access import Gate
 from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
-from service.deps import Service
+from service.deps import Service, known_parameters
 from service.heads import Heads
 from service.intake import Intake
 from service.jobs.runner import Jobs
@@ -21,6 +21,7 @@ from service.metrics import Metrics, Observe
 from service.registry import Registry
 from service.routes import dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.settings import Settings, read_settings
+from service.shortcut import Shortcut
 from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
@@ -30,7 +31,6 @@ from service.workbench import Workbench
 log = logging.getLogger("service")
 
 ROUTERS = (
-    telemetry.ingesting,  # first: routes are looked up in this order, and this one is asked for most
     telemetry.router,
     health.router,
     twins.router,
@@ -39,7 +39,6 @@ ROUTERS = (
     models.router,
     live.router,
     streams.router,
-    dashboard.router,
 )
 
 
@@ -119,9 +118,11 @@ def create_app(
     problems.install(app)
     _describe_access(app)
     for router in ROUTERS:
-        app.include_router(router)
+        app.include_router(router, dependencies=[Depends(known_parameters)])
+    app.include_router(dashboard.router)
     for path, files in dashboard.assets().items():
         app.mount(path, files, name=path)
+    app.add_middleware(Shortcut, route=telemetry.ingesting)
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.add_middleware(Gate, keys=settings.roles)
     app.add_middleware(Observe, metrics=metrics)

@@ -4,10 +4,12 @@ All of them are coroutines, although none waits: a plain function would be run i
 """
 
 import asyncio
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from fastapi import Depends, Path
+from fastapi.dependencies.models import Dependant
 from starlette.requests import HTTPConnection
 
 from service.access import Role
@@ -95,6 +97,26 @@ class Needs:
 
 reads = Depends(Needs(Role.read))
 operates = Depends(Needs(Role.operate))
+
+
+def refuse_unknown(connection: HTTPConnection, known: Collection[str] = ()) -> None:
+    """Refuse a query parameter that would be passed over: a slip in its name would go unnoticed (422)."""
+    if connection.scope["query_string"]:
+        errors = [(name, "unknown parameter") for name in connection.query_params if name not in known]
+        if errors:
+            expected = f"known: {', '.join(known)}" if known else "there are none"
+            raise Problem(422, f"{errors[0][0]}: unknown parameter ({expected})", errors)
+
+
+async def known_parameters(connection: HTTPConnection) -> None:
+    """Refuse query parameters that the route does not have."""
+    refuse_unknown(connection, _parameters(connection.scope["route"].dependant))
+
+
+def _parameters(dependant: Dependant) -> list[str]:
+    """Return the names of the query parameters of a route and of all that it depends on."""
+    inner = (name for part in dependant.dependencies for name in _parameters(part))
+    return [*(parameter.alias for parameter in dependant.query_params), *inner]
 
 
 TwinName = Annotated[str, Path(description="Id of a registered twin.")]

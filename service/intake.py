@@ -6,7 +6,9 @@ What a commit costs beside the disk (statements, hand-overs between threads) is 
 import asyncio
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,13 +20,12 @@ from service.registry import Entry
 from service.store import samples
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
 from service.store.samples import Receipt
-from service.streams import Hub
+from service.streams import Hub, Outcome
 
 OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT}
 
 
-@dataclass(frozen=True)
-class _Ticket:
+class _Ticket(NamedTuple):
     """A batch that waits to be stored, and where its receipt goes."""
 
     batch: Batch
@@ -38,39 +39,37 @@ class Intake:
         """Tell streams, trackers and metrics what was stored."""
         self._hub, self._live, self._metrics = hub, live, metrics
         self._loop = asyncio.get_running_loop()
-        self._lines: dict[int, list[_Ticket]] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._waiting: dict[int, list[_Ticket]] = {}
+        """Of each twin with a commit under way: what waits for it."""
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
         ticket = _Ticket(batch, self._loop.create_future())
-        line = self._lines.get(twin.key)
-        if line is not None:
-            line.append(ticket)
+        if twin.key in self._waiting:
+            self._waiting[twin.key].append(ticket)
         else:
-            self._lines[twin.key] = [ticket]
-            task = self._loop.create_task(self._serve(twin))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._begin(twin, [ticket])
         return await ticket.receipt
 
-    async def _serve(self, twin: Entry) -> None:
-        """Store whatever waits, commit after commit, until nothing does."""
-        while tickets := self._lines[twin.key]:
-            self._lines[twin.key] = []
-            await self._store(twin, tickets)
-        del self._lines[twin.key]
-
-    async def _store(self, twin: Entry, tickets: list[_Ticket]) -> None:
+    def _begin(self, twin: Entry, tickets: list[_Ticket]) -> None:
+        """Hand batches to the writer as one."""
+        self._waiting[twin.key] = []
         batch = _joined([ticket.batch for ticket in tickets])
-        try:
-            receipt = await self._hub.write(twin.key, _append, twin, batch)
-        except Exception as error:
+        self._hub.submit_then(partial(self._done, twin, tickets), twin.key, _append, twin, batch)
+
+    def _done(self, twin: Entry, tickets: list[_Ticket], outcome: Outcome[Receipt]) -> None:
+        """Begin with what waited meanwhile, and hand out the receipts; callers may have gone."""
+        waiting = self._waiting.pop(twin.key)
+        if waiting:
+            self._begin(twin, waiting)
+        error = outcome.exception()
+        if error is not None:
             for ticket in tickets:
-                if not ticket.receipt.done():  # its caller may have gone
+                if not ticket.receipt.done():
                     ticket.receipt.set_exception(error)
             return
-        self._tell(twin, batch, receipt)
+        receipt = outcome.result()[0]
+        self._tell(twin, receipt)
         first = 0
         for ticket in tickets:
             stop = first + ticket.batch.time_us.size
@@ -79,7 +78,7 @@ class Intake:
                 ticket.receipt.set_result(own)
             first = stop
 
-    def _tell(self, twin: Entry, batch: Batch, receipt: Receipt) -> None:
+    def _tell(self, twin: Entry, receipt: Receipt) -> None:
         counts = receipt.counts
         for outcome, status in OUTCOMES.items():
             if counts[status]:

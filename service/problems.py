@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError, WebSocketRequestValidatio
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 from starlette.routing import Match, Mount
+from starlette.types import Receive, Scope, Send
 
 from service.store.gone import TwinGone
 from twin_core.errors import TwinError
@@ -61,18 +62,36 @@ def problem(status: int, detail: str, errors: FieldErrors = (), headers: Mapping
 
 def install(app: FastAPI) -> None:
     """Answer every error of the application with a problem document."""
-    app.add_exception_handler(Problem, _on_problem)
+    for kind in TOLD:
+        app.add_exception_handler(kind, _on_told)
     app.add_exception_handler(HTTPException, _on_http)
     app.add_exception_handler(RequestValidationError, _on_validation)
     app.add_exception_handler(WebSocketRequestValidationError, _on_socket_validation)
-    app.add_exception_handler(TwinError, _on_twin_error)
-    app.add_exception_handler(TwinGone, _on_gone)
     app.add_exception_handler(Exception, _on_crash)
+    app.router.default = _nothing_there
 
 
-async def _on_problem(_: Request, error: Exception) -> Response:
-    assert isinstance(error, Problem)
-    return problem(error.status, error.detail, error.errors)
+TOLD = (Problem, TwinError, TwinGone)
+"""Errors that say what the caller did wrong, or what became of what it asked for."""
+
+
+def answer(error: Exception) -> Response:
+    """Return the response for one of these errors."""
+    if isinstance(error, Problem):
+        return problem(error.status, error.detail, error.errors)
+    if isinstance(error, TwinGone):
+        return problem(404, "the twin was deleted meanwhile")
+    field, separator, reason = str(error).partition(": ")
+    return problem(422, str(error), [(field, reason)] if separator and " " not in field else [])
+
+
+async def _nothing_there(scope: Scope, receive: Receive, send: Send) -> None:
+    """Refuse a path that leads nowhere; the framework would close web sockets there without a word."""
+    raise HTTPException(404)
+
+
+async def _on_told(_: Request, error: Exception) -> Response:
+    return answer(error)
 
 
 async def _on_http(request: Request, error: Exception) -> Response:
@@ -135,16 +154,6 @@ def _field(location: Sequence[str | int]) -> str:
     for part in parts:
         text += f"[{part}]" if isinstance(part, int) else f"{'.' if text else ''}{part}"
     return text or "body"
-
-
-async def _on_twin_error(_: Request, error: Exception) -> Response:
-    field, separator, reason = str(error).partition(": ")
-    errors = [(field, reason)] if separator and " " not in field else []
-    return problem(422, str(error), errors)
-
-
-async def _on_gone(_: Request, error: Exception) -> Response:
-    return problem(404, "the twin was deleted meanwhile")
 
 
 async def _on_crash(request: Request, error: Exception) -> Response:

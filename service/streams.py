@@ -7,7 +7,7 @@ memory or else from the store, and a reader that lags too far is told so and mov
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.messages import Json, Stretch, dropped
@@ -18,6 +18,8 @@ from service.store.database import Database
 
 P = ParamSpec("P")
 T = TypeVar("T")
+Outcome = Future[tuple[T, Sequence[Stretch]]]
+"""What came of a write that makes messages: its result and those messages, or an error."""
 
 IN_MEMORY = 1000
 """Messages of each twin that are kept in memory; readers that lag further behind are served from the store."""
@@ -72,7 +74,7 @@ class Hub:
         self._database, self._metrics, self._buffer = database, metrics, buffer
         self._loop = asyncio.get_running_loop()
         self._topics: dict[int, Topic] = {}
-        self._outcomes: deque[tuple[int, Future[Any], asyncio.Future[Any] | None]] = deque()
+        self._outcomes: deque[tuple[int, Outcome[Any], Callable[[Outcome[Any]], None]]] = deque()
 
     def open(self, twin: int, head: int) -> None:
         """Start the stream of a twin."""
@@ -99,34 +101,38 @@ class Hub:
         operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
         *args: P.args,
         **kwargs: P.kwargs,
-    ) -> "Future[tuple[T, Sequence[Stretch]]]":
+    ) -> None:
         """Queue a write that makes messages; they are published right after its commit. From any thread."""
-        answer = self._database.submit(operation, *args, **kwargs)
-        answer.add_done_callback(lambda done: self._after_commit(twin, done, None))
-        return answer
+        self.submit_then(_ignore, twin, operation, *args, **kwargs)
 
-    def _after_commit(self, twin: int, done: "Future[Any]", waiter: "asyncio.Future[Any] | None") -> None:
+    def submit_then(
+        self,
+        then: Callable[["Outcome[T]"], None],
+        twin: int,
+        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """The same, and let somebody hear in the event loop what came of it."""
+        answer = self._database.submit(operation, *args, **kwargs)
+        answer.add_done_callback(lambda done: self._after_commit(twin, done, then))
+
+    def _after_commit(self, twin: int, done: "Outcome[Any]", then: Callable[["Outcome[Any]"], None]) -> None:
         """Hand an outcome to the event loop; the writer calls this in the order of the commits.
 
         Waking the loop costs as much as a small write, so it is woken once for all that is handed over meanwhile.
         """
-        self._outcomes.append((twin, done, waiter))
+        self._outcomes.append((twin, done, then))
         if len(self._outcomes) == 1 and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take_outcomes)
 
     def _take_outcomes(self) -> None:
         """Publish what was committed, then let those who wait go on; in the event loop."""
         while self._outcomes:
-            twin, done, waiter = self._outcomes.popleft()
-            error = CancelledError() if done.cancelled() else done.exception()
-            if error is None:
+            twin, done, then = self._outcomes.popleft()
+            if done.exception() is None:
                 self.publish(twin, done.result()[1])
-            if waiter is None or waiter.done():
-                continue
-            if error is None:
-                waiter.set_result(done.result()[0])
-            else:
-                waiter.set_exception(error)
+            then(done)
 
     async def write(
         self,
@@ -137,8 +143,17 @@ class Hub:
     ) -> T:
         """Return the result of a write that makes messages, once it is committed."""
         waiter: asyncio.Future[T] = self._loop.create_future()
-        answer = self._database.submit(operation, *args, **kwargs)
-        answer.add_done_callback(lambda done: self._after_commit(twin, done, waiter))
+
+        def then(done: Outcome[T]) -> None:
+            if waiter.done():  # its caller may have gone
+                return
+            error = done.exception()
+            if error is None:
+                waiter.set_result(done.result()[0])
+            else:
+                waiter.set_exception(error)
+
+        self.submit_then(then, twin, operation, *args, **kwargs)
         return await waiter
 
     async def follow(self, twin: Entry, after_seq: int | None) -> AsyncIterator[list[Json]]:
@@ -185,6 +200,10 @@ class Hub:
         """Tell a reader that everything up to ``last`` is lost to it."""
         self._metrics.dropped.inc(last - position)
         return [dropped(position + 1, last)], last
+
+
+def _ignore(_: Outcome[Any]) -> None:
+    """Want to hear nothing."""
 
 
 async def _wait(waker: asyncio.Event) -> bool:

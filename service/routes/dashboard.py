@@ -3,10 +3,11 @@
 from pathlib import Path
 
 import fastapi_offline
-from fastapi import APIRouter
+from fastapi import APIRouter, HTTPException
 from fastapi.openapi.docs import get_swagger_ui_html
 from starlette.responses import FileResponse, HTMLResponse
 from starlette.staticfiles import StaticFiles
+from starlette.types import Receive, Scope, Send
 
 import twin_core
 
@@ -26,9 +27,19 @@ FOLDERS = {
 """Where the files of the pages lie: nothing is fetched from elsewhere, a ground station may have no internet."""
 
 
+class _Files(StaticFiles):
+    """A folder of files, in which a web socket finds nothing."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer with a file."""
+        if scope["type"] == "websocket":
+            raise HTTPException(404)
+        await super().__call__(scope, receive, send)
+
+
 def assets() -> dict[str, StaticFiles]:
     """Return what serves each folder of files, the longer path first."""
-    return {path: StaticFiles(directory=folder) for path, folder in FOLDERS.items()}
+    return {path: _Files(directory=folder) for path, folder in FOLDERS.items()}
 
 
 @router.get("/")

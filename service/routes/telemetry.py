@@ -1,16 +1,15 @@
 """Telemetry: take samples in, give the archive out."""
 
 import asyncio
-from collections.abc import Callable, Coroutine
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.routing import APIRoute
+from starlette.routing import Route
 
 from service.access import Role
-from service.deps import NamedTwin, Running, Service, TwinName, reads, require
+from service.deps import NamedTwin, Running, Service, TwinName, reads, refuse_unknown, require
 from service.downsample import extremes
 from service.frames import parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_parameter
@@ -38,26 +37,11 @@ _BODY = {
 }
 
 
-class _Direct(APIRoute):
-    """A route that is handed its request as it is: resolving dependencies costs more than the parsing of a sample."""
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """Return the endpoint itself."""
-
-        async def handle(request: Request) -> Response:
-            answer: Response = await self.endpoint(request, request.path_params["twin"])
-            return answer
-
-        return handle
-
-
-ingesting = APIRouter(prefix=PREFIX, tags=["telemetry"], route_class=_Direct)
-
-
-@ingesting.post("", response_model=IngestReport, openapi_extra=_BODY)
+@router.post("", response_model=IngestReport, openapi_extra=_BODY)
 async def ingest(request: Request, twin: TwinName) -> Response:
     """Store samples durably, then answer what became of each; a malformed body is refused whole."""
     require(request, Role.ingest)
+    refuse_unknown(request)
     service: Service = request.app.state.service
     entry = service.registry.get(twin)
     body = await request.body()
@@ -69,6 +53,10 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     entry.refuse_implausible(batch.values)
     receipt = await service.intake.store(entry, batch)
     return Response(orjson.dumps(_report(receipt)), media_type="application/json")
+
+
+(ingesting,) = (route for route in router.routes if isinstance(route, Route))
+"""The route of ``ingest``, for a way past the framework."""
 
 
 def _parser(content_type: str) -> Any:

@@ -7,6 +7,7 @@ A chunk holds three arrays as little-endian bytes: the stream numbers and instan
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -38,7 +39,7 @@ class Receipt:
         """Which samples were stored."""
         return self.status == ACCEPTED
 
-    @property
+    @cached_property
     def counts(self) -> list[int]:
         """How many samples have each status."""
         counts: list[int] = np.bincount(self.status, minlength=CONFLICT + 1).tolist()

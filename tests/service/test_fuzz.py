@@ -49,14 +49,17 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
         yield running
 
 
+def drawn(max_examples: int) -> settings:
+    """Return how requests are drawn."""
+    phases = [Phase.explicit, Phase.generate]
+    checks = list(HealthCheck)
+    return settings(
+        max_examples=max_examples, deadline=None, derandomize=True, phases=phases, suppress_health_check=checks
+    )
+
+
 @SCHEMA.parametrize()
-@settings(
-    max_examples=8,
-    deadline=None,
-    derandomize=True,
-    phases=[Phase.explicit, Phase.generate],
-    suppress_health_check=list(HealthCheck),
-)
+@drawn(max_examples=8)
 def test_no_request_breaks_the_service(case: Any, server: Server) -> None:
     response = case.call(base_url=server.url, timeout=20)
     assert response.status_code < 500, response.text
@@ -65,3 +68,12 @@ def test_no_request_breaks_the_service(case: Any, server: Server) -> None:
         problem = response.json()
         assert problem["status"] == response.status_code and problem["detail"]
     assert "unexpected" not in server.log()
+
+
+@SCHEMA.parametrize()
+@drawn(max_examples=2)
+def test_no_unknown_parameter_is_passed_over(case: Any, server: Server) -> None:
+    case.query = {**(case.query or {}), "surprise": "1"}
+    response = case.call(base_url=server.url, timeout=20)
+    assert 400 <= response.status_code < 500, response.text
+    assert response.headers["content-type"] == ["application/problem+json"], response.text

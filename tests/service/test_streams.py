@@ -149,6 +149,10 @@ def test_strangers_and_unknown_twins_are_refused(tmp_path: Path) -> None:
             (socket_url(server, "nosuch"), key, 404, None),
             (socket_url(server, "benchsat", "?after_seq=-1"), key, 422, "after_seq"),
             (socket_url(server, "benchsat", "?after_seq=x"), key, 422, "after_seq"),
+            (socket_url(server, "benchsat", "?after=1"), key, 422, "after"),
+            (socket_url(server, "benchsat").replace("/stream", "/streams"), key, 404, None),
+            (socket_url(server, "benchsat").replace("/stream", "/telemetry"), key, 404, None),
+            (server.url.replace("http", "ws") + "/assets/style.css", {}, 404, None),
         ):
             with pytest.raises(InvalidStatus) as refused:
                 connect(url, additional_headers=headers)
