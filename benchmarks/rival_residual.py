@@ -29,7 +29,7 @@ from twin_core.errors import TwinError
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.terms import Along
 from twin_core.simulate.kernels import GAMMA
-from twin_core.simulate.rollout import balance_along
+from twin_core.simulate.stages import balance_along
 from twin_core.telemetry import Record
 
 VALIDATED_SHARE = 0.3

@@ -15,7 +15,8 @@ from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.extrapolation import extrapolated_variance_K2, extrapolations, in_words
 from twin_core.simulate.forcing import Forcing, build_forcing
-from twin_core.simulate.rollout import Rollout, rollout, sensitivities
+from twin_core.simulate.response import sensitivities
+from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
 
 MAX_POINTS = 200_000
@@ -194,9 +195,7 @@ def _variance(
     covariance[n_free:, n_free:] = state_covariance
     blocks = [
         ((block @ covariance) * block).sum(axis=-1)
-        for _, block in sensitivities(
-            network, network.parameters.values, forcing, path, starts, n_free, network.sensor_node
-        )
+        for _, block in sensitivities(network, network.parameters.values, forcing, path, starts, network.sensor_node)
     ]
     lead = (time_s - time_s[0])[:, None]
     misfit = np.array([model.misfit_K[s] for s in model.spec.sensors])

@@ -64,7 +64,7 @@ def added_heat_W(effect: Effect, network: Network, along: Along, rate_K_per_s: n
         heat[:, list(part.nodes)] += part.heat_W
     for capacity in addition.capacities:
         names = (*(p.name for p in capacity.parameters), *capacity.borrows)
-        more = capacity.evaluate(along, np.array([named[n] for n in names]))
+        more = capacity.evaluate(along.temperatures_K[:, capacity.node], np.array([named[n] for n in names]))
         heat[:, more.node] -= more.extra_J_per_K * rate_K_per_s[:, more.node]
     return heat
 
@@ -196,7 +196,7 @@ def test_shapes_and_precision(kind: type[Effect], n_points: int) -> None:
         assert {e.node for e in part.d_values} <= set(part.nodes)
     for capacity in addition.capacities:
         names = (*(p.name for p in capacity.parameters), *capacity.borrows)
-        more = capacity.evaluate(along, np.array([named[n] for n in names]))
+        more = capacity.evaluate(along.temperatures_K[:, capacity.node], np.array([named[n] for n in names]))
         assert more.extra_J_per_K.shape == (n_points,)
         assert more.extra_J_per_K.dtype == np.float64
 

@@ -19,9 +19,9 @@ from twin_core.latent_force.held import HeldForce
 from twin_core.latent_force.whitening import affine_march
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
-from twin_core.simulate.kernels import GAMMA, march_sensitivities
 from twin_core.simulate.one_step import Steps, one_step
-from twin_core.simulate.rollout import balance_along
+from twin_core.simulate.response import sensitivities
+from twin_core.simulate.rollout import Rollout
 
 FLOOR_SHARE = 1e-3
 NO_HEAT_W = 1e-9
@@ -181,23 +181,10 @@ def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) ->
     The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`).
     """
     network, forcing = problem.network, nominal.segment.forcing
-    stages = nominal.steps.stages_K
-    balance = balance_along(network, values, forcing, stages, 0, forcing.n_steps, derivatives=True)
-    n, jacobian = problem.n_nodes, balance.jacobian_per_s
-    if network.capacities:
-        heated = balance_along(network, values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
-        jacobian = heated.jacobian_per_s
-    block, _ = march_sensitivities(
-        forcing.step_s,
-        jacobian.reshape(-1, 2, n, n),
-        balance.entry_free,
-        balance.entry_node,
-        balance.entry_series.reshape(balance.entry_free.size, forcing.n_steps, 2),
-        np.zeros((n, problem.n_free)),
-        forcing.sample_step,
-        network.sensor_node,
-        GAMMA,
-    )
+    path = Rollout(nominal.steps.stages_K, nominal.starts_K[0], True)
+    still = np.zeros((problem.n_nodes, problem.n_free))
+    parts = sensitivities(network, values, forcing, path, still, network.sensor_node)
+    block = np.concatenate([part for _, part in parts])
     return problem.with_reading_derivatives(values, nominal.segment, block)
 
 

@@ -12,7 +12,8 @@ from twin_core.network.model import Network
 from twin_core.network.spec import Interval, TwinSpec
 from twin_core.parameters.transforms import is_logarithmic
 from twin_core.simulate.forcing import Forcing, build_forcing
-from twin_core.simulate.rollout import Rollout, rollout, sensitivities
+from twin_core.simulate.response import sensitivities
+from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
 
 START_STD_SENSED_K = 5.0
@@ -241,7 +242,7 @@ class Problem:
         starts = np.hstack([np.zeros((self.n_nodes, self.n_free)), np.eye(self.n_nodes)])
         for i, (segment, path) in enumerate(zip(self.segments, fit.trajectories, strict=True)):
             observed = self.network.sensor_node[wanted]
-            parts = sensitivities(self.network, values, segment.forcing, path, starts, self.n_free, observed)
+            parts = sensitivities(self.network, values, segment.forcing, path, starts, observed)
             for samples, block in parts:
                 self._add_reading_derivatives(values, segment.record.clock_s, samples, wanted, block)
                 yield i, samples, block

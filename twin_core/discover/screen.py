@@ -16,8 +16,8 @@ from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.terms import Along
-from twin_core.simulate.kernels import GAMMA, march_sensitivities
-from twin_core.simulate.rollout import balance_along
+from twin_core.simulate.response import heat_response
+from twin_core.simulate.stages import balance_along
 
 COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 1.6e7
 """Responses held at once: so many columns, and so many numbers (130 MB): a long record is gone through in portions."""
@@ -129,24 +129,8 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
     for nominal, window in zip(fit.nominals, survey.segments(), strict=True):
         forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
         balance = balance_along(network, fit.values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
-        n = stages.shape[2]
-        jacobian = balance.jacobian_per_s.reshape(-1, 2, n, n)
-        rows = [
-            (column, node, series[window] / balance.capacity_J_per_K[:, node])
-            for column, (heat, _) in enumerate(columns)
-            for node, series in heat
-        ]
-        block, _ = march_sensitivities(
-            forcing.step_s,
-            jacobian,
-            np.array([r[0] for r in rows], dtype=np.int64),
-            np.array([r[1] for r in rows], dtype=np.int64),
-            np.array([r[2] for r in rows]).reshape(len(rows), forcing.n_steps, 2),
-            np.zeros((n, len(columns))),
-            forcing.sample_step,
-            network.sensor_node,
-            GAMMA,
-        )
+        heats = [(k, node, series[window]) for k, (heat, _) in enumerate(columns) for node, series in heat]
+        block = heat_response(balance, forcing, heats, len(columns), network.sensor_node)
         at = np.maximum(2 * forcing.sample_step - 1, 0)
         for column, (_, readings) in enumerate(columns):
             for sensor, series in readings:

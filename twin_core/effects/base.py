@@ -306,8 +306,9 @@ class Effect(ABC):
                 if entry.item in scaled:
                     columns[scaled[entry.item]].append((entry.node, entry.series))
         for capacity in alone.capacities:
+            temperature_K = survey.along.temperatures_K[:, capacity.node]
             scaled = self._scaled_by(capacity.parameters)
-            for entry in capacity.evaluate(survey.along, self._null_values(capacity, survey)).d_values:
+            for entry in capacity.evaluate(temperature_K, self._null_values(capacity, survey)).d_values:
                 if entry.item in scaled:
                     swallowed = -entry.series * survey.rate_K_per_s[:, entry.node]
                     columns[scaled[entry.item]].append((entry.node, swallowed))

@@ -9,7 +9,7 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
-from twin_core.network.terms import Along, Capacity, Entry
+from twin_core.network.terms import Capacity, Entry
 from twin_core.parameters.parameter import Parameter
 
 LEAST_SHARE = 0.2
@@ -25,19 +25,28 @@ class LinearCapacity:
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...]
 
-    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
+    def evaluate(self, temperature_K: FloatArray, values: FloatArray) -> Capacity:
         """Evaluate the change of capacity; the node's own capacity is borrowed."""
         kappa, capacity = values
-        away = along.temperatures_K[:, self.node] - self.reference_K
+        away = temperature_K - self.reference_K
         line = 1.0 + kappa * away
+        bent = line < LEAST_SHARE
         bend = 1.0 / (2.0 - np.minimum(line / LEAST_SHARE, 1.0))
-        share = np.where(line < LEAST_SHARE, LEAST_SHARE * bend, line)
+        share = np.where(bent, LEAST_SHARE * bend, line)
         slope = bend**2
+        # The integral of share - 1 over temperature: a parabola, and on from where the line bends a logarithm.
+        stored, d_stored = 0.5 * kappa * away**2, 0.5 * away**2
+        if bent.any():
+            beyond = 0.5 * (LEAST_SHARE**2 + 1.0) + LEAST_SHARE**2 * np.log(bend) - line
+            stored = np.where(bent, beyond / kappa, stored)
+            d_stored = np.where(bent, (share - 1.0) * away / kappa - beyond / kappa**2, d_stored)
         return Capacity(
             self.node,
             capacity * (share - 1.0),
             capacity * slope * kappa,
             [Entry(0, self.node, capacity * slope * away), Entry(1, self.node, share - 1.0)],
+            capacity * stored,
+            [Entry(0, self.node, capacity * d_stored), Entry(1, self.node, stored)],
         )
 
 

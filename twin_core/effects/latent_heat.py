@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.special import ndtr
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
-from twin_core.network.terms import Along, Capacity, Entry
+from twin_core.network.terms import Capacity, Entry
 from twin_core.parameters.parameter import Parameter
 
 N_CENTRES = 9
@@ -25,12 +26,12 @@ class Melting:
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
 
-    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
-        """Evaluate the extra capacity (apparent heat capacity method)."""
+    def evaluate(self, temperature_K: FloatArray, values: FloatArray) -> Capacity:
+        """Evaluate the extra capacity and what it has taken up."""
         heat, centre, width = values
-        x = (along.temperatures_K[:, self.node] - centre) / width
+        x = (temperature_K - centre) / width
         density = np.exp(-0.5 * x**2) / (np.sqrt(2.0 * np.pi) * width)
-        extra = heat * density
+        extra, molten = heat * density, ndtr(x)
         return Capacity(
             self.node,
             extra,
@@ -40,6 +41,8 @@ class Melting:
                 Entry(1, self.node, extra * x / width),
                 Entry(2, self.node, extra * (x**2 - 1.0) / width),
             ],
+            heat * molten,
+            [Entry(0, self.node, molten), Entry(1, self.node, -extra), Entry(2, self.node, -extra * x)],
         )
 
 
@@ -49,7 +52,7 @@ class LatentHeat(Effect):
     name = "latent_heat"
     keys = ("node",)
     equation = "C -> C + L g(T), g = exp(-(T - T_m)^2 / (2 w^2)) / (w sqrt(2 pi))"
-    reference = "Bonacina et al., Int. J. Heat Mass Transfer 16 (1973): apparent heat capacity"
+    reference = "Bonacina et al., Int. J. Heat Mass Transfer 16 (1973): apparent heat capacity; stepped by its enthalpy"
     words = "takes up latent heat around a temperature"
 
     def qualities(self) -> tuple[Quality, ...]:

@@ -9,7 +9,7 @@ from twin_core.latent_force.linearised import Linearised
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import GAMMA
-from twin_core.simulate.rollout import balance_along
+from twin_core.simulate.stages import balance_along
 
 
 def grid_times_s(forcing: Forcing) -> FloatArray:

@@ -8,39 +8,68 @@ import numpy as np
 from twin_core._typing import FloatArray, IntArray
 from twin_core.network.jacobian import Jacobian, JacobianSum
 from twin_core.network.model import Network
+from twin_core.network.storage import store
 from twin_core.network.terms import Along, Entry
 
 
 @dataclass(frozen=True)
 class Balance:
-    """Rates and derivatives at n_points.
+    """Heats and derivatives at n_points.
+
+    A node of capacity C(T) holds the enthalpy C_0 u, u = T + (integral of C - C_0) / C_0 with C_0 its own capacity, and
+    C_0 du/dt = heat holds whatever C(T) is. That is the form in which steps are taken (``jacobian`` and ``entry_series``):
+    it keeps the energy balance over a step of any length. Without terms of capacity u is T.
 
     Attributes
     ----------
-    rate_K_per_s : (n_points, n_nodes)
-    jacobian
-        d rate / d temperature; ``jacobian_per_s`` holds it as (n_points, n_nodes, n_nodes).
     heat_W : (n_points, n_nodes)
         Net heat into each node.
+    flow
+        d heat / d temperature over the own capacity.
+    own_J_per_K : (n_nodes,)
+        C_0.
     capacity_J_per_K : (n_points, n_nodes)
+        C(T).
+    bend_per_K, slope : (n_points, n_nodes)
+        d ln C / d T and d T / d u = C_0 / C.
+    moves
+        Nodes whose capacity depends on their temperature.
     entry_free, entry_node : (n_entries,)
         Which free parameter and which node a derivative series belongs to.
     entry_series : (n_entries, n_points)
-        d rate / d free parameter, in the solver's coordinate.
+        d (heat / C_0) / d free parameter, in the solver's coordinate, at the same temperatures.
     """
 
-    rate_K_per_s: FloatArray
-    jacobian: Jacobian
     heat_W: FloatArray
+    flow: Jacobian
+    own_J_per_K: FloatArray
     capacity_J_per_K: FloatArray
+    bend_per_K: FloatArray
+    slope: FloatArray
+    moves: tuple[int, ...]
     entry_free: IntArray
     entry_node: IntArray
     entry_series: FloatArray
 
     @cached_property
+    def rate_K_per_s(self) -> FloatArray:
+        """d T / d t, (n_points, n_nodes)."""
+        return self.heat_W / self.capacity_J_per_K
+
+    @cached_property
     def jacobian_per_s(self) -> FloatArray:
-        """The Jacobian as dense matrices."""
-        return self.jacobian.dense()
+        """d (d T / d t) / d T as dense matrices, (n_points, n_nodes, n_nodes)."""
+        dense = self.flow.dense()
+        if self.moves:
+            dense *= self.slope[:, :, None]
+            nodes = np.arange(self.own_J_per_K.size)
+            dense[:, nodes, nodes] -= self.rate_K_per_s * self.bend_per_K
+        return dense
+
+    @cached_property
+    def jacobian(self) -> Jacobian:
+        """d (d u / d t) / d u."""
+        return self.flow.with_columns_scaled(self.moves, self.slope) if self.moves else self.flow
 
 
 def fill_boundaries(network: Network, values: FloatArray, boundaries_K: FloatArray) -> FloatArray:
@@ -102,17 +131,22 @@ def evaluate_balance(
                 for e in part.d_boundaries
                 if network.boundary_index[e.item] >= 0
             ]
-    capacity, slope, capacity_entries = _capacities(network, values, along)
-    rate = heat / capacity
-    moves = [node for node in range(n_nodes) if slope[:, node].any()] if network.capacities else []
-    correction = -rate * slope / capacity if moves else slope
-    slopes = jacobian.over(capacity, moves, correction)
-    if not derivatives:
-        nothing = np.zeros(0, dtype=np.int64)
-        return Balance(rate, slopes, heat, capacity, nothing, nothing, np.zeros((0, n_points)))
-    rows = [Entry(e.item, e.node, e.series / capacity[:, e.node]) for e in entries]
-    rows += [Entry(e.item, e.node, -e.series * rate[:, e.node] / capacity[:, e.node]) for e in capacity_entries]
-    return _free_entries(network, values, rate, slopes, heat, capacity, rows)
+    own = values[network.capacity_index]
+    storage = store(network, values, along.temperatures_K)
+    flow = jacobian.over(own, n_points)
+    rows = [Entry(e.item, e.node, e.series / own[e.node]) for e in entries]
+    if derivatives:
+        rows += [Entry(int(i), n, -heat[:, n] / own[n] ** 2) for n, i in enumerate(network.capacity_index)]
+    return Balance(
+        heat,
+        flow,
+        own,
+        storage.capacity_J_per_K,
+        storage.bend_per_K,
+        storage.slope,
+        storage.moves,
+        *free_entries(network, values, rows, n_points),
+    )
 
 
 def reading_offsets_K(network: Network, values: FloatArray, clock_s: FloatArray) -> FloatArray:
@@ -134,38 +168,16 @@ def reading_offsets_K(network: Network, values: FloatArray, clock_s: FloatArray)
     return offset
 
 
-def _capacities(network: Network, values: FloatArray, along: Along) -> tuple[FloatArray, FloatArray, list[Entry]]:
-    """Return the capacity of each node (n_points, n_nodes), its slope with temperature, and derivative entries of C."""
-    n_points, n_nodes = along.temperatures_K.shape
-    capacity = np.broadcast_to(values[network.capacity_index], (n_points, n_nodes)).copy()
-    slope = np.zeros((n_points, n_nodes))
-    one = np.ones(n_points)
-    entries = [Entry(int(index), node, one) for node, index in enumerate(network.capacity_index)]
-    for term in network.capacities:
-        index = network.term_index(term)
-        part = term.evaluate(along, values[index])
-        capacity[:, part.node] += part.extra_J_per_K
-        slope[:, part.node] += part.d_temperature
-        entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
-    return capacity, slope, entries
-
-
-def _free_entries(
-    network: Network,
-    values: FloatArray,
-    rate: FloatArray,
-    jacobian: Jacobian,
-    heat: FloatArray,
-    capacity: FloatArray,
-    rows: list[Entry],
-) -> Balance:
-    """Keep the entries of free parameters, in the solver's coordinate."""
+def free_entries(
+    network: Network, values: FloatArray, rows: list[Entry], n_points: int
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the entries of free parameters, in the solver's coordinate: which parameter, which node, the series."""
     parameters = network.parameters
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
-    at = parameters.at_values(values)
-    slopes = {int(i): at.parameters[i].transform.slope(at.parameters[i].free) for i in parameters.free_index}
     kept = [row for row in rows if row.item in position]
-    series = np.array([slopes[row.item] * row.series for row in kept]).reshape(len(kept), rate.shape[0])
+    at = parameters.at_values(values)
+    slopes = {item: at.parameters[item].transform.slope(at.parameters[item].free) for item in {r.item for r in kept}}
+    series = np.array([slopes[row.item] * row.series for row in kept]).reshape(len(kept), n_points)
     free = np.array([position[row.item] for row in kept], dtype=np.int64)
     node = np.array([row.node for row in kept], dtype=np.int64)
-    return Balance(rate, jacobian, heat, capacity, free, node, series)
+    return free, node, series

@@ -33,6 +33,28 @@ class Jacobian:
             out[:, i, j] += self.moving[:, entry]
         return out
 
+    def with_columns_scaled(self, columns: Sequence[int], factor: FloatArray) -> "Jacobian":
+        """Return the matrices with some columns scaled at each point: all their entries move then.
+
+        Parameters
+        ----------
+        columns
+            Nodes.
+        factor : (n_points, n_nodes)
+        """
+        constant = self.constant.copy()
+        constant[:, list(columns)] = 0.0
+        scaled = np.isin(self.column, columns)
+        moving = np.where(scaled, self.moving * factor[:, self.column], self.moving)
+        more = [(i, j) for j in columns for i in np.flatnonzero(self.constant[:, j])]
+        row, column = np.array(more, dtype=np.int64).reshape(len(more), 2).T
+        return Jacobian(
+            constant,
+            np.concatenate([self.row, row]),
+            np.concatenate([self.column, column]),
+            np.hstack([moving, self.constant[row, column] * factor[:, column]]),
+        )
+
 
 class JacobianSum:
     """The sum of the terms' Jacobians, entry by entry where it moves."""
@@ -52,27 +74,10 @@ class JacobianSum:
                 if part.d_temperature[:, a, b].any():
                     self.moving.append((row, column, part.d_temperature[:, a, b]))
 
-    def over(self, capacity: FloatArray, movable: Sequence[int], correction: FloatArray) -> Jacobian:
-        """Return the Jacobian of the rates.
-
-        Parameters
-        ----------
-        capacity : (n_points, n_nodes)
-        movable
-            Nodes whose capacity is not the same everywhere: all their entries move.
-        correction : (n_points, n_nodes)
-            What the capacity's slope adds to their diagonal.
-        """
-        constant = self.constant / (capacity[0] if len(capacity) else np.ones(capacity.shape[1]))[:, None]
-        constant[list(movable)] = 0.0
-        entries = [(row, column, series / capacity[:, row]) for row, column, series in self.moving]
-        for node in movable:
-            entries += [
-                (node, int(j), self.constant[node, j] / capacity[:, node]) for j in np.flatnonzero(self.constant[node])
-            ]
-            entries.append((node, node, correction[:, node]))
-        moving = np.empty((capacity.shape[0], len(entries)))
-        for k, (_, _, series) in enumerate(entries):
-            moving[:, k] = series
-        where = np.array([(row, column) for row, column, _ in entries], dtype=np.int64).reshape(len(entries), 2)
-        return Jacobian(constant, where[:, 0].copy(), where[:, 1].copy(), moving)
+    def over(self, capacity_J_per_K: FloatArray, n_points: int) -> Jacobian:
+        """Return the Jacobian of the heats over each node's own capacity (n_nodes,), at n_points."""
+        moving = np.empty((n_points, len(self.moving)))
+        for k, (row, _, series) in enumerate(self.moving):
+            moving[:, k] = series / capacity_J_per_K[row]
+        where = np.array([(row, column) for row, column, _ in self.moving], dtype=np.int64).reshape(-1, 2)
+        return Jacobian(self.constant / capacity_J_per_K[:, None], where[:, 0].copy(), where[:, 1].copy(), moving)

@@ -93,12 +93,17 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Capacity:
-    """Extra capacity of one node: (n_points,) in J/K, its slope in J/K^2, and parameter derivatives."""
+    """Extra capacity of one node: (n_points,) in J/K, its slope in J/K^2, and parameter derivatives.
+
+    ``stored_J`` is its integral over temperature, from wherever; ``d_stored`` are that integral's parameter derivatives.
+    """
 
     node: int
     extra_J_per_K: FloatArray
     d_temperature: FloatArray
     d_values: list[Entry]
+    stored_J: FloatArray
+    d_stored: list[Entry]
 
 
 class CapacityTerm(Protocol):
@@ -114,8 +119,13 @@ class CapacityTerm(Protocol):
         """Names of network parameters that it needs too."""
         ...
 
-    def evaluate(self, along: Along, values: FloatArray) -> Capacity:
-        """Return the extra capacity and derivatives at the given points."""
+    @property
+    def node(self) -> int:
+        """The node that has it."""
+        ...
+
+    def evaluate(self, temperature_K: FloatArray, values: FloatArray) -> Capacity:
+        """Return the extra capacity and derivatives at temperatures (n_points,) of its node."""
         ...
 
 

@@ -9,8 +9,9 @@ from twin_core.effects.base import Beyond, Effect
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import GAMMA, march_sensitivities
-from twin_core.simulate.rollout import Rollout, balance_along
+from twin_core.simulate.response import heat_response
+from twin_core.simulate.rollout import Rollout
+from twin_core.simulate.stages import balance_along
 
 
 def extrapolations(
@@ -43,20 +44,9 @@ def extrapolated_variance_K2(
     """
     if not beyond:
         return np.zeros((forcing.sample_step.size, observed.size))
-    n_nodes = len(network.nodes)
     balance = balance_along(network, network.parameters.values, forcing, path.stages_K, 0, forcing.n_steps)
-    rates = [one.std_W / balance.capacity_J_per_K[:, one.node] for one in beyond]
-    response, _ = march_sensitivities(
-        forcing.step_s,
-        balance.jacobian_per_s.reshape(-1, 2, n_nodes, n_nodes),
-        np.arange(len(beyond), dtype=np.int64),
-        np.array([one.node for one in beyond], dtype=np.int64),
-        np.array(rates).reshape(len(beyond), forcing.n_steps, 2),
-        np.zeros((n_nodes, len(beyond))),
-        forcing.sample_step,
-        observed,
-        GAMMA,
-    )
+    heats = [(column, one.node, one.std_W) for column, one in enumerate(beyond)]
+    response = heat_response(balance, forcing, heats, len(beyond), observed)
     return np.asarray((response**2).sum(axis=-1))
 
 

@@ -1,20 +1,21 @@
-"""The rollout: the heat balance integrated from one initial state, with exact sensitivities.
+"""The rollout: the heat balance integrated from one initial state.
 
-The implicit scheme's equations of a whole stretch of steps are solved together by Newton's method: the heat balance is
-evaluated once for all points (vectorised), the linear recursion runs compiled. A stretch that does not converge is cut
-in half, down to one step.
+Steps are taken in the nodes' enthalpies: a capacity that changes within a step takes up all of its heat, and the implicit
+equations have one solution where the heats fall as the temperatures rise. Those of a whole stretch of steps are solved
+together by Newton's method: the heat balance is evaluated once for all points (vectorised), the linear recursion runs
+compiled. A stretch that does not converge is cut, down to one step.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
 from twin_core.network.model import Network
+from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import GAMMA, march, march_sensitivities
+from twin_core.simulate.kernels import GAMMA, march
+from twin_core.simulate.stages import balance_along
 
 STRETCH = 1024
 """Steps solved together at first: long enough to vectorise well, short enough for Newton to converge from a constant."""
@@ -95,13 +96,16 @@ def _newton(
     last: int,
     guess: FloatArray,
 ) -> FloatArray | None:
-    """Solve steps first..last-1 together; None if Newton's method does not settle."""
+    """Solve steps first..last-1 together for the enthalpies; None if Newton's method does not settle."""
     n_steps, n_nodes = last - first, start_K.size
-    stages = np.clip(guess, *LIMIT_K)
+    shape = (n_steps, 2, n_nodes)
+    temperatures = np.clip(guess, *LIMIT_K)
+    start, stages = to_enthalpy_K(network, values, start_K), to_enthalpy_K(network, values, temperatures)
+    lowest, highest = (to_enthalpy_K(network, values, np.full(n_nodes, limit)) for limit in LIMIT_K)
     change_before = np.inf
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
-        balance = balance_along(network, values, forcing, stages, first, last)
-        jacobian, rate = balance.jacobian, balance.rate_K_per_s.reshape(n_steps, 2, n_nodes)
+        balance = balance_along(network, values, forcing, temperatures, first, last)
+        jacobian, rate = balance.jacobian, (balance.heat_W / balance.own_J_per_K).reshape(shape)
         solved = march(
             forcing.step_s[first:last],
             jacobian.constant,
@@ -110,93 +114,23 @@ def _newton(
             jacobian.moving.reshape(n_steps, 2, jacobian.row.size),
             rate,
             stages,
-            start_K,
+            start,
             GAMMA,
         )
         change = float(np.abs(solved - stages).max())
         if not np.isfinite(change):
             return None
-        inside = solved.min() >= LIMIT_K[0] and solved.max() <= LIMIT_K[1]
+        inside = bool((solved >= lowest).all() and (solved <= highest).all())
         # Newton's method contracts: the next change is no larger than this one times the last contraction (Hairer and
         # Wanner 1996, section IV.8), and the pass that would only confirm it is spared.
         contraction = min(1.0, change / change_before) if iteration > 0 else 1.0
         if change * contraction < TOLERANCE_K:
-            return solved if inside else None
+            return to_temperatures_K(network, values, solved, temperatures, LIMIT_K) if inside else None
         # A step across a kink may swing from one side to the other: half the way ends that.
         stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved
-        stages = stages if inside else np.clip(stages, *LIMIT_K)
+        stages = stages if inside else np.clip(stages, lowest, highest)
+        temperatures = to_temperatures_K(network, values, stages, temperatures, LIMIT_K)
         if iteration > 8 and change > change_before and n_steps > 1:
             return None
         change_before = change
     return None
-
-
-def balance_along(
-    network: Network,
-    values: FloatArray,
-    forcing: Forcing,
-    stages_K: FloatArray,
-    first: int,
-    last: int,
-    *,
-    derivatives: bool = False,
-    extra_W: FloatArray | None = None,
-) -> Balance:
-    """Evaluate the heat balance at the stages of steps first..last-1, flattened to (2 n_steps, ...).
-
-    ``extra_W`` (n_steps, n_nodes) is heat beyond the network's terms; a capacity answers to it as to any other.
-    """
-    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
-    along = forcing.along(stages_K.reshape(-1, stages_K.shape[2]), boundaries, first, last)
-    extra = None if extra_W is None else np.repeat(extra_W, 2, axis=0)
-    return evaluate_balance(network, values, along, derivatives=derivatives, extra_W=extra)
-
-
-def sensitivities(
-    network: Network,
-    values: FloatArray,
-    forcing: Forcing,
-    trajectory: Rollout,
-    start_columns: FloatArray,
-    n_free: int,
-    observed: IntArray,
-) -> Iterator[tuple[slice, FloatArray]]:
-    """Yield d observed state / d (free parameters, start columns) at the samples, stretch by stretch.
-
-    Parameters
-    ----------
-    network, values, forcing, trajectory
-        A converged rollout.
-    start_columns : (n_nodes, n_columns)
-        d start / d column: columns beyond ``n_free`` belong to the initial state.
-    n_free
-        Number of leading columns that are the network's free parameters.
-    observed : (n_observed,)
-        States wanted.
-
-    Yields
-    ------
-    slice, (n_samples_here, n_observed, n_columns)
-        Which samples, and their derivatives: exact for the discrete scheme.
-    """
-    state = start_columns.astype(np.float64)
-    n_nodes = state.shape[0]
-    for first in range(0, max(forcing.n_steps, 1), 2 * STRETCH):
-        last = min(first + 2 * STRETCH, forcing.n_steps)
-        low = int(np.searchsorted(forcing.sample_step, first, side="left" if first == 0 else "right"))
-        high = int(np.searchsorted(forcing.sample_step, last, side="right"))
-        balance = balance_along(
-            network, values, forcing, trajectory.stages_K[first:last], first, last, derivatives=True
-        )
-        block, state = march_sensitivities(
-            forcing.step_s[first:last],
-            balance.jacobian_per_s.reshape(-1, 2, n_nodes, n_nodes),
-            balance.entry_free,
-            balance.entry_node,
-            balance.entry_series.reshape(balance.entry_free.size, last - first, 2),
-            state,
-            forcing.sample_step[low:high] - first,
-            observed,
-            GAMMA,
-        )
-        yield slice(low, high), block

@@ -18,7 +18,7 @@ from twin_core.errors import ModelError
 from twin_core.forecast import forecast
 from twin_core.network.model import build_network
 from twin_core.network.spec import load_spec
-from twin_core.simulate.rollout import sensitivities
+from twin_core.simulate.response import sensitivities
 from twin_core.telemetry import Record
 
 STEP_S, CAPACITY, CONDUCTANCE, WALL_W_PER_K, ROOM_K = 20.0, np.array([4.0e3, 7.0e3]), 2.5, 0.9, 285.0
@@ -136,7 +136,6 @@ def own_gradient(problem_data: dict[str, Any], record: Record, n_steps: int) -> 
             segment.forcing,
             fit.trajectories[0],
             columns,
-            own.n_free,
             network.sensor_node,
         )
         residual = own.residuals(fit)[0][1:]

@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import cumulative_simpson, solve_ivp
+from scipy.special import ndtr
 
-from tests.helpers import at_named, conductive_spec, record_of
+from tests.helpers import at_named, central_difference, conductive_spec, record_of
 from twin_core.effects import REGISTRY, Effect
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import load_spec
+from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 
@@ -23,20 +25,97 @@ def network_with(effect: Effect) -> Network:
     return at_named(build_network(load_spec(spec), [effect]), {"C:n0": C})
 
 
-def warmed(effect: Effect, heat_W: np.ndarray, time_s: np.ndarray, start_K: float) -> np.ndarray:
+def warmed(
+    effect: Effect, heat_W: np.ndarray, time_s: np.ndarray, start_K: float, max_step_s: float = 5.0
+) -> np.ndarray:
     network = network_with(effect)
-    forcing = build_forcing(network, record_of(time_s, Q=heat_W), 5.0)
+    forcing = build_forcing(network, record_of(time_s, Q=heat_W), max_step_s)
     path = rollout(network, network.parameters.values, np.array([start_K]), forcing)
     assert path.converged
     return path.at_samples(forcing.sample_step)[:, 0]
 
 
-def test_melting_takes_up_its_latent_heat() -> None:
-    """Energy: C (T - T_0) + L = Q t once all is melted."""
-    time_s = 60.0 * np.arange(121)
-    found = warmed(MELTING, np.full(121, POWER_W), time_s, 290.0)
+@pytest.mark.parametrize("width_K", [1.5, 0.05, 1e-3])
+@pytest.mark.parametrize("step_s", [5.0, 60.0, 720.0])
+def test_melting_takes_up_its_latent_heat(width_K: float, step_s: float) -> None:
+    """Energy: C (T - T_0) + L = Q t once all is melted, however long the steps and however narrow the peak."""
+    time_s = step_s * np.arange(7200.0 / step_s + 1.0)
+    melting = MELTING.with_values({"w_K": width_K})
+    found = warmed(melting, np.full(time_s.size, POWER_W), time_s, 290.0, step_s)
     assert found[-1] > 310.0
-    np.testing.assert_allclose(C * (found[-1] - 290.0) + 3.0e4, POWER_W * time_s[-1], rtol=1e-4)
+    np.testing.assert_allclose(C * (found[-1] - 290.0) + 3.0e4, POWER_W * time_s[-1], rtol=1e-9)
+    back = warmed(melting, np.full(time_s.size, -POWER_W), time_s, float(found[-1]), step_s)
+    np.testing.assert_allclose(back[-1], 290.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("width_K", [2.0, 0.1])
+def test_melting_between_two_nodes_with_long_steps_is_that_of_scipy(width_K: float) -> None:
+    """A node that freezes and melts through a stiff coupling, sampled once a minute; SciPy integrates the enthalpies."""
+    spec = conductive_spec(
+        2,
+        [(0, 1)],
+        channels={"Q": {"kind": "power", "unit": "W"}},
+        loads=[{"channel": "Q", "node": "n0"}],
+    )
+    effect = REGISTRY["latent_heat"]({"node": "n1"}, {"L_J": 9.0e3, "T_m_K": 300.0, "w_K": width_K})
+    network = at_named(build_network(load_spec(spec), [effect]), {"C:n0": 900.0, "C:n1": 600.0, "G:n0|n1": 8.0})
+    time_s = 60.0 * np.arange(300)
+    heat = np.where(np.arange(300) % 60 < 30, 25.0, -25.0)
+    forcing = build_forcing(network, record_of(time_s, Q=heat), 60.0)
+    path = rollout(network, network.parameters.values, np.array([298.0, 298.0]), forcing)
+    assert path.converged
+    found = path.at_samples(forcing.sample_step)
+
+    grid_K = np.linspace(200.0, 400.0, 400_001)
+    grid_J = 600.0 * grid_K + 9.0e3 * ndtr((grid_K - 300.0) / width_K)
+
+    def flow(t: float, h: np.ndarray) -> list[float]:
+        exchanged = 8.0 * (h[0] / 900.0 - np.interp(h[1], grid_J, grid_K))
+        return [heat[min(int(t / 60.0), 299)] - exchanged, exchanged]
+
+    start = [900.0 * 298.0, float(np.interp(298.0, grid_K, grid_J))]
+    stiff = {"method": "Radau", "max_step": 20.0, "rtol": 1e-8, "atol": 1e-3}
+    truth = solve_ivp(flow, (0.0, time_s[-1]), start, t_eval=time_s, **stiff).y
+    np.testing.assert_allclose(found[:, 0], truth[0] / 900.0, atol=0.25)
+    np.testing.assert_allclose(found[:, 1], np.interp(truth[1], grid_J, grid_K), atol=0.25)
+    held = 900.0 * found[:, 0] + 600.0 * found[:, 1] + 9.0e3 * ndtr((found[:, 1] - 300.0) / width_K)
+    put_in = np.concatenate([[0.0], np.cumsum(60.0 * heat[:-1])])
+    np.testing.assert_allclose(held - held[0], put_in, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "effect, values",
+    [(MELTING, (3.0e4, 300.0, 1.5)), *((STIFFENING, (kappa, C)) for kappa in (-0.3, -1e-3, 0.0, 0.02, 0.3))],
+)
+def test_what_a_capacity_stores_is_its_integral(effect: Effect, values: tuple[float, ...]) -> None:
+    """By quadrature, across where the line bends; and the derivatives of both by central differences."""
+    term = network_with(effect).capacities[0]
+    fine_K = np.linspace(270.0, 320.0, 500_001)
+    temperature = fine_K[::1000]
+    part = term.evaluate(temperature, np.array(values))
+    integral = cumulative_simpson(term.evaluate(fine_K, np.array(values)).extra_J_per_K, x=fine_K, initial=0.0)[::1000]
+    scale = np.abs(integral).max() + 1.0
+    np.testing.assert_allclose(part.stored_J - part.stored_J[0], integral, atol=1e-7 * scale)
+    for entry in part.d_stored:
+
+        def stored(x: float, item: int = entry.item) -> np.ndarray:
+            return term.evaluate(temperature, np.array([*values[:item], x, *values[item + 1 :]])).stored_J
+
+        at = values[entry.item]
+        expected = central_difference(stored, at, 1e-4 * max(abs(at), 0.01))
+        np.testing.assert_allclose(entry.series, expected, atol=1e-5 * (np.abs(expected).max() + 1e-9))
+
+
+@pytest.mark.parametrize("width_K", [3.0, 0.2, 1e-3])
+def test_a_temperature_is_found_from_its_enthalpy(width_K: float) -> None:
+    network = network_with(MELTING.with_values({"w_K": width_K}))
+    values = network.parameters.values
+    temperature = np.linspace(250.0, 350.0, 1001)[:, None]
+    enthalpy = to_enthalpy_K(network, values, temperature)
+    assert (np.diff(enthalpy[:, 0]) > 0.0).all()
+    for near in (temperature, np.full_like(temperature, 250.0), np.full_like(temperature, 300.0)):
+        found = to_temperatures_K(network, values, enthalpy, near, (0.5, 5e3))
+        np.testing.assert_allclose(found, temperature, atol=1e-9)
 
 
 def test_a_capacity_that_grows_takes_up_more() -> None:
@@ -45,7 +124,7 @@ def test_a_capacity_that_grows_takes_up_more() -> None:
     found = warmed(STIFFENING, np.full(121, POWER_W), time_s, 290.0)
     x = found - 295.0
     stored = C * (x + 0.01 * x**2) - C * (-5.0 + 0.01 * 25.0)
-    np.testing.assert_allclose(stored, POWER_W * time_s, rtol=1e-4, atol=0.1)
+    np.testing.assert_allclose(stored, POWER_W * time_s, rtol=1e-9, atol=1e-6)
 
 
 @pytest.mark.parametrize("effect", [MELTING, STIFFENING], ids=lambda e: e.name)
@@ -70,7 +149,5 @@ def test_a_cycle_is_that_of_scipy(effect: Effect) -> None:
 def test_a_capacity_stays_positive_whatever_the_temperature(kappa: float) -> None:
     network = network_with(STIFFENING.with_values({"kappa_per_K": kappa}))
     temperature = np.linspace(1.0, 4000.0, 5000)
-    forcing = build_forcing(network, record_of(np.arange(2501.0), Q=0.0), 1.0)
-    along = forcing.along(temperature[:, None], forcing.boundaries_flat_K(0, 2500), 0, 2500)
-    part = network.capacities[0].evaluate(along, np.array([kappa, C]))
+    part = network.capacities[0].evaluate(temperature, np.array([kappa, C]))
     assert (C + part.extra_J_per_K > 0.0).all()

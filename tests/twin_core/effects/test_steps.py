@@ -25,7 +25,8 @@ from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import load_spec
 from twin_core.simulate.forcing import build_forcing
-from twin_core.simulate.rollout import rollout, sensitivities
+from twin_core.simulate.response import sensitivities
+from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
 CAPACITY = np.array([4.0e3, 9.0e3])
@@ -141,7 +142,7 @@ def test_the_onset_has_an_exact_derivative(effect: Effect) -> None:
     path = rollout(network, parameters.values, start, forcing)
     n_free = len(parameters.free_names)
     starts = np.hstack([np.zeros((2, n_free)), np.eye(2)])
-    blocks = sensitivities(network, parameters.values, forcing, path, starts, n_free, np.arange(2))
+    blocks = sensitivities(network, parameters.values, forcing, path, starts, np.arange(2))
     found = np.concatenate([block for _, block in blocks])[:, :, column] / parameters.slopes(parameters.free)[column]
     expected = central_difference(read, onset, 0.1)
     scale = float(np.abs(expected).max())

@@ -73,7 +73,8 @@ def test_parameter_entries_are_the_central_difference(name: str | None) -> None:
         def rates(x: float, column: int = column) -> np.ndarray:
             moved = free.copy()
             moved[column] = x
-            return balance_at(network, along, network.parameters.to_values(moved)).rate_K_per_s
+            balance = balance_at(network, along, network.parameters.to_values(moved))
+            return balance.heat_W / balance.own_J_per_K
 
         step = 1e-3 * max(1.0, 1e-1 * abs(float(free[column])))
         assert_slope(found[:, :, column], rates, float(free[column]), step, network.parameters.free_names[column])

@@ -11,16 +11,15 @@ from twin_core.network.terms import Heat
 def test_the_parts_add_up_to_the_dense_sum(n_points: int) -> None:
     rng = np.random.default_rng(n_points)
     fixed, local = rng.normal(size=(1, 3, 3)), rng.normal(size=(n_points, 2, 2))
-    capacity = np.broadcast_to([2.0, 3.0, 5.0], (n_points, 3)).copy()
-    capacity[:, 1] += rng.uniform(0.0, 4.0, n_points)
-    correction = np.zeros((n_points, 3))
-    correction[:, 1] = rng.normal(size=n_points)
+    slope = np.ones((n_points, 3))
+    slope[:, 1] = rng.uniform(0.1, 2.0, n_points)
+    own = np.array([2.0, 3.0, 5.0])
     total = JacobianSum(3)
     total.add(Heat((0, 1, 2), np.zeros((n_points, 3)), fixed))
     total.add(Heat((2, 0), np.zeros((n_points, 2)), local))
-    found = total.over(capacity, [1], correction)
+    found = total.over(own, n_points).with_columns_scaled([1], slope)
     expected = np.repeat(fixed, n_points, axis=0)
     for point in range(n_points):
         expected[point][np.ix_([2, 0], [2, 0])] += local[point]
-        expected[point] = expected[point] / capacity[point][:, None] + np.diag(correction[point])
+        expected[point] = expected[point] / own[:, None] * slope[point]
     np.testing.assert_allclose(found.dense(), expected, rtol=1e-12, atol=1e-14)

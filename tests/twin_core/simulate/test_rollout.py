@@ -22,7 +22,8 @@ from twin_core.effects import REGISTRY
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import load_spec
 from twin_core.simulate.forcing import Forcing, build_forcing
-from twin_core.simulate.rollout import Rollout, rollout, sensitivities
+from twin_core.simulate.response import sensitivities
+from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
 
 POWER: dict[str, Any] = {"kind": "power", "unit": "W"}
@@ -271,7 +272,7 @@ def all_sensitivities(network: Network, forcing: Forcing, path: Rollout) -> np.n
     n_free, n_nodes = network.parameters.free_index.size, len(network.nodes)
     columns = np.hstack([np.zeros((n_nodes, n_free)), np.eye(n_nodes)])
     observed = np.arange(n_nodes)
-    parts = list(sensitivities(network, network.parameters.values, forcing, path, columns, n_free, observed))
+    parts = list(sensitivities(network, network.parameters.values, forcing, path, columns, observed))
     covered = np.concatenate([np.arange(forcing.sample_step.size)[where] for where, _ in parts])
     np.testing.assert_array_equal(covered, np.arange(forcing.sample_step.size))
     return np.concatenate([block for _, block in parts])
