@@ -160,9 +160,12 @@ def prune(state: Search, needed: float) -> None:
 
 def _drop(state: Search, place: object, needed: float) -> None:
     """Drop the effect at a place if the model without it is hardly less likely."""
-    without = try_effects(state.trial, [e for e in state.trial.effects if e.place != place], n_passes=10)
+    others = [e for e in state.trial.effects if e.place != place]
+    if not others:
+        return
+    without = try_effects(state.trial, others, n_passes=10)
     worth_of_it = weigh(without, state.trial, 1).log_bayes_factor
-    if worth_of_it > needed or not without.effects:
+    if worth_of_it > needed:
         return
     state.trial = without
     state.findings = [f.without(place, worth_of_it, without) for f in state.findings]

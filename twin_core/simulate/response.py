@@ -92,7 +92,7 @@ def heat_response(
     entries = (
         np.array([column for column, _, _ in heats], dtype=np.int64),
         np.array([node for _, node, _ in heats], dtype=np.int64),
-        np.array([heat / balance.own_J_per_K[node] for _, node, heat in heats]).reshape(len(heats), -1),
+        np.array([heat / balance.own_J_per_K[node] for _, node, heat in heats]).reshape(-1, 2 * forcing.n_steps),
     )
     still = np.zeros((n_nodes, n_columns))
     block, _ = _march(balance, forcing.step_s, entries, still, np.ones((1, n_nodes)), forcing.sample_step, observed)

@@ -99,6 +99,21 @@ def test_the_numbers_stand_in_the_page() -> None:
     assert "leak to boundary from px to bus" in page.text
 
 
+@pytest.mark.parametrize("experiments", [None, [], [False], [True, False]])
+def test_what_would_tell_a_finding_from_its_alternatives(experiments: list[bool] | None) -> None:
+    """What decides is listed; where nothing does it is said; a report that does not know says neither."""
+    report = example_report()
+    if experiments is not None:
+        report["findings"][0]["experiments"] = [
+            {"experiment": f"warm it {k}", "sensor": "T_px", "apart_K": 0.51, "apart_std": 5.1, "decides": decides}
+            for k, decides in enumerate(experiments)
+        ]
+    text = Page(render(report, example_plots())).text
+    assert ("Nothing that was looked at would" in text) == (experiments is not None and not any(experiments))
+    assert ("warm it 0: the models would part by 0.51 K at T_px, 5.1 times its noise" in text) == any(experiments or [])
+    assert "warm it 1" not in text
+
+
 def test_nothing_is_loaded_from_elsewhere() -> None:
     page = render(example_report(), example_plots())
     assert Page(page).loaded == ["data:,"]
