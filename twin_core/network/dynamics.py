@@ -172,6 +172,9 @@ def free_entries(
     network: Network, values: FloatArray, rows: list[Entry], n_points: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """Return the entries of free parameters, in the solver's coordinate: which parameter, which node, the series."""
+    if not rows:
+        nothing = np.zeros(0, dtype=np.int64)
+        return nothing, nothing, np.zeros((0, n_points))
     parameters = network.parameters
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
     kept = [row for row in rows if row.item in position]

@@ -3,7 +3,7 @@
 Steps are taken in the nodes' enthalpies: a capacity that changes within a step takes up all of its heat, and the implicit
 equations have one solution where the heats fall as the temperatures rise. Those of a whole stretch of steps are solved
 together by Newton's method: the heat balance is evaluated once for all points (vectorised), the linear recursion runs
-compiled. A stretch that does not converge is cut, down to one step.
+compiled. Of a stretch that does not converge the leading steps that do are kept, and it is cut, down to one step.
 """
 
 from dataclasses import dataclass
@@ -77,13 +77,16 @@ def rollout(
         last = min(done + stretch, forcing.n_steps)
         guess = np.broadcast_to(state, (last - done, 2, n_nodes)) if near is None else near[done:last]
         solved = _newton(network, values, state, forcing, done, last, guess)
-        if solved is None:
-            if stretch == 1:
-                return Rollout(out, start_K, False)
-            stretch, near = max(1, (last - done) // 4), None
-            continue
-        out[done:last] = solved
-        state, done, stretch = solved[-1, 1], last, min(STRETCH, stretch * 2)
+        n_solved = solved.shape[0]
+        if n_solved == 0 and stretch == 1:
+            return Rollout(out, start_K, False)
+        if n_solved < last - done:
+            stretch, near = max(1, n_solved, (last - done) // 4), None
+        else:
+            stretch = min(STRETCH, stretch * 2)
+        if n_solved > 0:
+            out[done : done + n_solved] = solved
+            state, done = solved[-1, 1], done + n_solved
     return Rollout(out, start_K, True)
 
 
@@ -95,14 +98,17 @@ def _newton(
     first: int,
     last: int,
     guess: FloatArray,
-) -> FloatArray | None:
-    """Solve steps first..last-1 together for the enthalpies; None if Newton's method does not settle."""
+) -> FloatArray:
+    """Solve steps first..last-1 together for the enthalpies; return the stage states of the leading steps that settle.
+
+    A step settles once those before it have: where the method takes long for all, it has not been in vain for the first.
+    """
     n_steps, n_nodes = last - first, start_K.size
     shape = (n_steps, 2, n_nodes)
     temperatures = np.clip(guess, *LIMIT_K)
     start, stages = to_enthalpy_K(network, values, start_K), to_enthalpy_K(network, values, temperatures)
     lowest, highest = (to_enthalpy_K(network, values, np.full(n_nodes, limit)) for limit in LIMIT_K)
-    change_before = np.inf
+    change_before, settled = np.inf, 0
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
         balance = balance_along(network, values, forcing, temperatures, first, last)
         jacobian, rate = balance.jacobian, (balance.heat_W / balance.own_J_per_K).reshape(shape)
@@ -117,20 +123,26 @@ def _newton(
             start,
             GAMMA,
         )
-        change = float(np.abs(solved - stages).max())
+        changes = np.abs(solved - stages).max(axis=(1, 2))
+        change = float(changes.max())
         if not np.isfinite(change):
-            return None
+            return solved[:0]
         inside = bool((solved >= lowest).all() and (solved <= highest).all())
         # Newton's method contracts: the next change is no larger than this one times the last contraction (Hairer and
         # Wanner 1996, section IV.8), and the pass that would only confirm it is spared.
         contraction = min(1.0, change / change_before) if iteration > 0 else 1.0
         if change * contraction < TOLERANCE_K:
-            return to_temperatures_K(network, values, solved, temperatures, LIMIT_K) if inside else None
+            settled = n_steps
+            break
+        settled = int(np.argmax(changes >= TOLERANCE_K))
         # A step across a kink may swing from one side to the other: half the way ends that.
         stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved
         stages = stages if inside else np.clip(stages, lowest, highest)
         temperatures = to_temperatures_K(network, values, stages, temperatures, LIMIT_K)
         if iteration > 8 and change > change_before and n_steps > 1:
-            return None
+            break
         change_before = change
-    return None
+    leading = solved[:settled]
+    if not ((leading >= lowest).all() and (leading <= highest).all()):
+        return solved[:0]
+    return to_temperatures_K(network, values, leading, temperatures[:settled], LIMIT_K)
