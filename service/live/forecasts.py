@@ -100,6 +100,16 @@ def quantile_name(probability: float) -> str:
     return f"q{percent:02.0f}" if percent.is_integer() else f"q{percent:g}"
 
 
+def notice(tracker: Tracker) -> list[str]:
+    """Say that a sample waits to be assimilated, if one does."""
+    if tracker.waits_us is None:
+        return []
+    when = format_instant(tracker.waits_us)
+    return [
+        f"the last sample, of {when}, lies far ahead of the others and waits for another one: its clock may be wrong"
+    ]
+
+
 def render(twin: Entry, active: Active, position: Position, made: Forecasted, quantiles: Sequence[float]) -> Json:
     """Return a forecast as clients see it."""
     values = {

@@ -12,14 +12,20 @@ from service.store.samples import Samples
 from service.workbench import Telemetry
 
 Json = dict[str, Any]
-_KEPT = ("seq", "state", "held", "detector", "sampling_s")
+_KEPT = ("seq", "state", "held", "detector", "recent_us")
+
+RECENT = 12
+"""So many of the last instants tell the usual distance of samples."""
+FAR = 10.0
+"""In usual distances: a lone sample that lies further ahead of the others may be of a wrong clock."""
 
 
 @dataclass(frozen=True)
 class Position:
     """Where the assimilation stands: the last assimilated sample, its state, and the inputs that hold there.
 
-    ``seq`` is the number at which the stream stood when the archive was read up to here.
+    ``seq`` is the number at which the stream stood when the archive was read up to here, ``recent_us`` are the last
+    instants, this one included.
     """
 
     time_us: int
@@ -28,7 +34,12 @@ class Position:
     state: Json
     held: dict[str, float]
     detector: Json
-    sampling_s: float
+    recent_us: list[int]
+
+    @property
+    def sampling_s(self) -> float:
+        """The usual distance of samples."""
+        return float(np.median(np.diff(self.recent_us))) / 1e6 if len(self.recent_us) > 1 else 60.0
 
     @classmethod
     def of(cls, checkpoint: Checkpoint) -> "Position":
@@ -63,24 +74,13 @@ def stretch(twin: Entry, fresh: Samples, epoch_us: int, before: Position | None)
     return Telemetry(epoch_us, np.concatenate([np.array(known_us, dtype=np.int64), fresh.time_us]), values), after
 
 
-def next_count(time_us: NDArray[np.int64], before: Position | None, longest_gap_us: float) -> int:
-    """Return how many of the next samples are assimilated together: none beyond a long gap, of which a step begins.
-
-    A single sample after a long gap waits for another one: it may be that only its clock is wrong.
-    """
-    if before is None or time_us.size == 0:
-        known = time_us
-    else:
-        known = np.concatenate([[before.time_us], time_us])
-    offset = known.size - time_us.size
-    gaps = np.flatnonzero(np.diff(known) > longest_gap_us) + 1 - offset
-    if offset and time_us.size == 1 and gaps.size:
-        return 0
-    return int(min((gap for gap in gaps if gap > 0), default=time_us.size))
+def next_count(time_us: NDArray[np.int64], longest_gap_us: float) -> int:
+    """Return how many of the next samples are assimilated together: none beyond a long gap, of which a step begins."""
+    return int(min(np.flatnonzero(np.diff(time_us) > longest_gap_us) + 1, default=time_us.size))
 
 
-def sampling_s(time_us: NDArray[np.int64], before: Position | None) -> float:
-    """Return the usual distance of samples."""
-    if time_us.size > 10 or before is None:
-        return float(np.median(np.diff(time_us))) / 1e6 if time_us.size > 1 else 60.0
-    return before.sampling_s
+def is_far(time_us: NDArray[np.int64], before: Position | None, longest_gap_us: float) -> bool:
+    """Return whether the last sample lies far ahead of all others: it may be that only its clock is wrong."""
+    steps = np.diff(np.concatenate([np.array([] if before is None else before.recent_us, dtype=np.int64), time_us]))
+    reach_us = min(longest_gap_us, FAR * np.median(steps[:-1])) if steps.size > 1 else longest_gap_us
+    return steps.size > 0 and bool(steps[-1] > reach_us)

@@ -12,7 +12,7 @@ from service.instants import now_us
 from service.messages import EventStretch, ResidualStretch, Stretch
 from service.registry import Entry
 from service.store import anomalies, checkpoints, events, residuals, samples
-from service.store.anomalies import Change
+from service.store.anomalies import AnomalyRow, Change
 from service.store.checkpoints import Checkpoint
 from service.store.residuals import Residuals
 from service.store.samples import Samples
@@ -55,6 +55,8 @@ class Reading:
         The stream stood at this number.
     late_us
         First instant of a sample that lies before the position, came after it was read and matters; None if there is none.
+    until_us
+        What was read and lies behind the first long gap after ``late_us`` begins here; None if there is no such gap.
     fresh
         The next samples.
     told : (n_times,)
@@ -63,6 +65,7 @@ class Reading:
 
     seq: int
     late_us: int | None
+    until_us: int | None
     fresh: Samples
     told: NDArray[np.bool_]
 
@@ -79,20 +82,39 @@ def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None,
     residuals.append(connection, twin.key, found)
     if n_told:
         stretches.append(ResidualStretch(twin.sensors, found.take(step.told)))
+    ended = (
+        anomalies.close(connection, twin.key, step.version, step.after_us, step.after_us + 1) if step.after_gap else []
+    )
     rows = anomalies.apply(connection, twin.key, step.version, step.changes, step.span_us)
-    if rows:
-        messages = [("anomaly", {"anomaly": row.wire()}) for row in rows]
-        stretches.append(EventStretch(tuple(events.append(connection, twin.key, now_us(), messages))))
+    stretches += _news(connection, twin, ended + rows)
     checkpoints.put(connection, twin.key, step.version, step.checkpoint, keep_previous=step.after_gap)
     return None, stretches
 
 
-def rewind(connection: sqlite3.Connection, twin: Entry, version: int, late_us: int) -> Checkpoint | None:
-    """Go back to the last checkpoint before a late sample and forget what was derived after it."""
+def _news(connection: sqlite3.Connection, twin: Entry, rows: Sequence[AnomalyRow]) -> list[Stretch]:
+    """Return the messages that tell of anomalies."""
+    if not rows:
+        return []
+    messages = [("anomaly", {"anomaly": row.wire()}) for row in rows]
+    return [EventStretch(tuple(events.append(connection, twin.key, now_us(), messages)))]
+
+
+def end_record(
+    connection: sqlite3.Connection, twin: Entry, version: int, last_us: int, until_us: int
+) -> tuple[None, Sequence[Stretch]]:
+    """Write down that ``last_us`` is the last sample before a long gap, behind which ``until_us`` is known already."""
+    return None, _news(connection, twin, anomalies.close(connection, twin.key, version, last_us, until_us))
+
+
+def rewind(
+    connection: sqlite3.Connection, twin: Entry, version: int, late_us: int, until_us: int | None
+) -> Checkpoint | None:
+    """Go back to the last checkpoint before a late sample and forget what was derived from there to ``until_us``."""
     checkpoint = checkpoints.before(connection, twin.key, version, late_us)
     after_us = -(2**62) if checkpoint is None else checkpoint.time_us
-    checkpoints.forget_after(connection, twin.key, version, after_us)
-    residuals.truncate(connection, twin.key, version, len(twin.sensors), after_us)
+    stop_us = 2**62 if until_us is None else until_us
+    checkpoints.forget(connection, twin.key, version, after_us, stop_us)
+    residuals.forget(connection, twin.key, version, len(twin.sensors), after_us, stop_us)
     return _dated(connection, twin, checkpoint)
 
 
@@ -106,6 +128,7 @@ def _dated(connection: sqlite3.Connection, twin: Entry, checkpoint: Checkpoint |
     """Return a checkpoint that knows what of the archive it had read; those of earlier releases do not say."""
     if checkpoint is not None:
         checkpoint.body.setdefault("seq", samples.latest_seq(connection, twin.key))
+        checkpoint.body.setdefault("recent_us", [checkpoint.time_us])
     return checkpoint
 
 
@@ -116,8 +139,9 @@ def look(
     told_seq: int,
     most: int,
     longest_gap_us: float,
+    until_us: int | None,
 ) -> Reading:
-    """Return at most ``most`` samples after what was read, and whether that has changed since.
+    """Return at most ``most`` samples between what was read and ``until_us``, and whether what was read has changed since.
 
     ``read`` are the stretches that were read, in order: (after, until] and the number at which the stream stood then.
     ``told_seq`` is the number up to which samples count as told.
@@ -126,7 +150,10 @@ def look(
     late = [samples.arrived(connection, twin.key, number, after + 1, until + 1) for after, until, number in read]
     first = _first_in_company(connection, twin.key, np.unique(np.concatenate([*late, _NONE])), longest_gap_us)
     after_us = read[-1][1] if read else None
+    known_us = None if first is None else _next_record(connection, twin.key, first, read[-1][1], longest_gap_us)
     stop_us = samples.block_stop(connection, twin.key, after_us, most)
+    if until_us is not None:
+        stop_us = until_us if stop_us is None else min(stop_us, until_us)
     n = len(twin.channels)
     found = samples.select(connection, twin.key, n, range(n), None if after_us is None else after_us + 1, stop_us)
     fresh = Samples(found.time_us[:most], found.values[:, :most])
@@ -134,7 +161,7 @@ def look(
     if fresh.time_us.size:
         span = (int(fresh.time_us[0]), int(fresh.time_us[-1]) + 1)
         told = np.isin(fresh.time_us, samples.arrived(connection, twin.key, told_seq, *span))
-    return Reading(seq, first, fresh, told)
+    return Reading(seq, first, known_us, fresh, told)
 
 
 def _first_in_company(
@@ -150,3 +177,12 @@ def _first_in_company(
         if (near != instant).any():
             return int(instant)
     return None
+
+
+def _next_record(
+    connection: sqlite3.Connection, twin: int, first_us: int, last_us: int, longest_gap_us: float
+) -> int | None:
+    """Return the first instant behind the first long gap between two instants; None if there is no such gap."""
+    instants = np.unique(samples.arrived(connection, twin, -1, first_us, last_us + 1))
+    gaps = np.flatnonzero(np.diff(instants) > longest_gap_us)
+    return int(instants[gaps[0] + 1]) if gaps.size else None

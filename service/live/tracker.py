@@ -2,14 +2,15 @@
 
 import asyncio
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.instants import format_instant
 from service.live import progress
 from service.live.engine import Engine
-from service.live.position import Position, next_count, sampling_s, stretch
+from service.live.position import RECENT, Position, is_far, next_count, stretch
 from service.live.progress import Reading, Step
 from service.metrics import Metrics
 from service.problems import Problem
@@ -60,6 +61,20 @@ class _Caution:
         self.most, self.stride, self.skipped = min(2 * self.most, progress.BLOCK), 1, None
 
 
+@dataclass(frozen=True)
+class _Detour:
+    """A return to late samples that ends where a long gap does: behind it the state starts anew, so all there stays true.
+
+    ``back`` is where the assimilation goes on afterwards, with what was read until then; ``n_samples`` is how many
+    there had been where the detour began.
+    """
+
+    until_us: int
+    back: Position
+    read: list[tuple[int, int, int]]
+    n_samples: int
+
+
 class Tracker:
     """Keeps one twin's state up to date in the background."""
 
@@ -69,16 +84,26 @@ class Tracker:
         """Start in the background; the state comes from the last checkpoint."""
         self.twin = twin
         self.active: Active | None = None
-        self.position: Position | None = None
+        self.waits_us: int | None = None
+        """Instant of a lone sample far ahead of the others, which waits for company; None if there is none."""
         self.trouble: str | None = None
         self.catching_up = False
         self._database, self._hub, self._engine = database, hub, engine
         self._metrics, self._thresholds = metrics, thresholds
         self._caution = _Caution()
+        self._at: Position | None = None
+        self._read: list[tuple[int, int, int]] = []
+        """What was read of the archive, see ``look``."""
+        self._detour: _Detour | None = None
         self._told_seq, self._new_model = 0, True
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
         self._task = asyncio.create_task(self._run())
+
+    @property
+    def position(self) -> Position | None:
+        """Where the assimilation stands, or where it goes on after a detour."""
+        return self._at if self._detour is None else self._detour.back
 
     def arrived(self) -> None:
         """Hear that samples were stored."""
@@ -133,33 +158,47 @@ class Tracker:
         self._new_model = False
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
-            self.active, self.position, self.catching_up = None, None, False
+            self.active, self.catching_up, self._detour = None, False, None
+            self._stand(None)
             return
         if self.active is not None and self.active.version == active.version:
             return
         checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
         self._caution, self.trouble, self.catching_up = _Caution(), None, True
-        self.position = None if checkpoint is None else Position.of(checkpoint)
+        self._detour, self.waits_us = None, None
+        self._stand(None if checkpoint is None else Position.of(checkpoint))
         self.active = active
+
+    def _stand(self, position: Position | None) -> None:
+        """Go on from a position, up to which the archive was read when the stream stood at its number."""
+        self._at = position
+        self._read = [] if position is None else [(_EVER, position.time_us, position.seq)]
 
     async def _advance(self, active: Active) -> bool:
         """Assimilate the next block, or go back to before a late sample; return whether there may be more."""
-        before, caution = self.position, self._caution
-        read = [] if before is None else [(_EVER, before.time_us, before.seq)]
+        before, caution, detour = self._at, self._caution, self._detour
+        read = self._read
         if caution.skipped is not None:
-            read.append((read[-1][1] if read else _EVER, *caution.skipped))
+            read = [*read, (read[-1][1] if read else _EVER, *caution.skipped)]
+        until_us = None if detour is None else detour.until_us
         reading = await self._database.read(
-            progress.look, self.twin, read, self._told_seq, max(caution.most, 2), active.longest_gap_us
+            progress.look, self.twin, read, self._told_seq, max(caution.most, 2), active.longest_gap_us, until_us
         )
         if reading.late_us is not None:
             self._caution = _Caution()
             if before is not None and reading.late_us <= before.time_us:
-                checkpoint = await self._database.write(progress.rewind, self.twin, active.version, reading.late_us)
-                self.position = None if checkpoint is None else Position.of(checkpoint)
+                await self._go_back(active, before, reading.late_us, reading.until_us)
             return True
-        count = next_count(reading.fresh.time_us, before, active.longest_gap_us)
+        time_us = reading.fresh.time_us
+        count = next_count(time_us, active.longest_gap_us)
+        if detour is None and count == time_us.size > 0 and is_far(time_us, before, active.longest_gap_us):
+            count -= 1
+        if count == 0 and detour is not None:
+            await self._return(active, detour, reading.seq)
+            return True
         if count == 0:
             self._told_seq, self.catching_up = reading.seq, False
+            self._wait(int(time_us[0]) if time_us.size else None)
             return False
         self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
@@ -179,6 +218,36 @@ class Tracker:
         await self._keep(active, before, fresh, done, held, reading)
         return True
 
+    async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
+        """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""
+        if self._detour is not None:
+            until_us = self._detour.until_us
+        arguments = (self.twin, active.version, late_us, until_us)
+        checkpoint = await self._database.write(progress.rewind, *arguments)
+        if self._detour is None and until_us is not None:
+            self._detour = _Detour(until_us, before, self._read, 0 if checkpoint is None else checkpoint.n_samples)
+        self._stand(None if checkpoint is None else Position.of(checkpoint))
+
+    async def _return(self, active: Active, detour: _Detour, seq: int) -> None:
+        """End a detour: the archive before its end was read when the stream stood at ``seq``."""
+        done, back = self._at, detour.back
+        if done is not None:
+            arguments = (self.twin, active.version, done.time_us, detour.until_us)
+            await self._hub.write(self.twin.key, progress.end_record, *arguments)
+            back = replace(back, n_samples=back.n_samples + done.n_samples - detour.n_samples)
+        self._detour, self._caution = None, _Caution()
+        self._stand(back)
+        last_us = detour.until_us - 1
+        beyond = [(max(after, last_us), until, number) for after, until, number in detour.read if until > last_us]
+        self._read = [(_EVER, last_us, seq), *beyond]
+
+    def _wait(self, instant_us: int | None) -> None:
+        """Note that a lone sample waits for company, or that none does."""
+        if instant_us is not None and instant_us != self.waits_us:
+            extra = {"twin": self.twin.name, "sample": format_instant(instant_us)}
+            log.warning("a lone sample far ahead of the others waits for company", extra=extra)
+        self.waits_us = instant_us
+
     async def _keep(
         self,
         active: Active,
@@ -192,19 +261,19 @@ class Tracker:
         time_us = fresh.time_us
         new = slice(-time_us.size, None)
         innovation, std, nis = done.innovation_K[new], done.innovation_std_K[new], done.nis[new]
-        detector = None if before is None else before.detector
+        before_us = _EVER if before is None else before.time_us
+        after_gap = before is not None and bool(time_us[0] - before_us > active.longest_gap_us)
+        detector = None if before is None or after_gap else before.detector
         values = fresh.values[[self.twin.channels.index(s) for s in done.sensors]].T
         detector, intervals = detect(detector, done.sensors, time_us, values, innovation, std, nis, self._thresholds)
         changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
-        usual_s = sampling_s(time_us, before)
-        after = Position(int(time_us[-1]), reading.seq, count, done.state, held, detector, usual_s)
-        before_us = _EVER if before is None else before.time_us
-        after_gap = before is not None and bool(time_us[0] - before_us > active.longest_gap_us)
-        told = reading.told[: time_us.size]
+        recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
+        after = Position(int(time_us[-1]), reading.seq, count, done.state, held, detector, recent_us)
+        told = reading.told[: time_us.size] | (time_us == self.waits_us)
         step = Step(
             active.version, before_us, after_gap, time_us, innovation, std, nis, told, changes, after.checkpoint()
         )
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
         self._metrics.assimilated.inc(int(time_us.size))
-        self.position = after
+        self._stand(after)

@@ -41,10 +41,12 @@ async def forecast_as_is(
 
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
-    active, position = await forecasts.state_of(service.live.tracker(twin))
+    tracker = service.live.tracker(twin)
+    active, position = await forecasts.state_of(tracker)
     task = forecasts.build_task(twin, active, position, request)
     made = await service.live.engine.forecast(active.document, task)
     document = forecasts.render(twin, active, position, made, request.quantiles)
+    document["notices"] += forecasts.notice(tracker)
     return Response(orjson.dumps(document), media_type="application/json")
 
 

@@ -97,6 +97,13 @@ def apply(
     ]
 
 
+def close(connection: sqlite3.Connection, twin: int, version: int, stop_us: int, until_us: int) -> list[AnomalyRow]:
+    """End the intervals that began before ``until_us`` and last: nothing is known of what followed ``stop_us`` there."""
+    query = """UPDATE anomaly SET stop_us = max(start_us, ?) WHERE twin = ? AND version = ? AND stop_us IS NULL
+               AND start_us < ? RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
+    return [AnomalyRow(*row) for row in connection.execute(query, (stop_us, twin, version, until_us)).fetchall()]
+
+
 def _same(
     connection: sqlite3.Connection, twin: int, version: int, change: Change, after_us: int, taken: set[int]
 ) -> AnomalyRow | None:

@@ -26,8 +26,8 @@ def put(
 ) -> None:
     """Store a checkpoint, and forget the previous one unless it is worth keeping."""
     rows = connection.execute(
-        "SELECT time_us, n FROM checkpoint WHERE twin = ? AND version = ? ORDER BY time_us DESC LIMIT 2",
-        (twin, version),
+        "SELECT time_us, n FROM checkpoint WHERE twin = ? AND version = ? AND time_us < ? ORDER BY time_us DESC LIMIT 2",
+        (twin, version, checkpoint.time_us),
     ).fetchall()
     if not keep_previous and len(rows) == 2 and checkpoint.n_samples - rows[1][1] < EVERY:
         _delete(connection, twin, version, [rows[0][0]])
@@ -60,8 +60,7 @@ def before(connection: sqlite3.Connection, twin: int, version: int, time_us: int
     return None if row is None else Checkpoint(row[0], row[1], orjson.loads(row[2]))
 
 
-def forget_after(connection: sqlite3.Connection, twin: int, version: int, time_us: int) -> None:
-    """Forget the checkpoints after an instant: they did not know of a late sample."""
-    connection.execute(
-        "DELETE FROM checkpoint WHERE twin = ? AND version = ? AND time_us > ?", (twin, version, time_us)
-    )
+def forget(connection: sqlite3.Connection, twin: int, version: int, after_us: int, until_us: int) -> None:
+    """Forget the checkpoints after < time < until: they did not know of a late sample."""
+    query = "DELETE FROM checkpoint WHERE twin = ? AND version = ? AND time_us > ? AND time_us < ?"
+    connection.execute(query, (twin, version, after_us, until_us))

@@ -109,17 +109,19 @@ def _insert(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> 
     outline.put(connection, "residual", int(row.lastrowid or 0), residuals.time_us, packed)
 
 
-def truncate(connection: sqlite3.Connection, twin: int, version: int, n_sensors: int, after_us: int) -> None:
-    """Forget one version's residuals after an instant."""
+def forget(
+    connection: sqlite3.Connection, twin: int, version: int, n_sensors: int, after_us: int, until_us: int
+) -> None:
+    """Forget one version's residuals of after < time < until."""
     rows = connection.execute(
         """SELECT id, seq, time, value FROM residual
-           WHERE twin = ? AND last_us > ? AND version = ?""",
-        (twin, after_us, version),
+           WHERE twin = ? AND last_us > ? AND first_us < ? AND version = ?""",
+        (twin, after_us, until_us, version),
     ).fetchall()
     for chunk, seq, time, value in rows:
         connection.execute("DELETE FROM residual WHERE id = ?", (chunk,))
         residuals = _unpack(n_sensors, version, seq, time, value)
-        append(connection, twin, residuals.take(residuals.time_us <= after_us))
+        append(connection, twin, residuals.take((residuals.time_us <= after_us) | (residuals.time_us >= until_us)))
 
 
 def select(

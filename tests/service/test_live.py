@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.store import stream
 from service.workbench import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
@@ -240,7 +241,7 @@ DAYS = 86_400.0
 LATER = 5000 * DAYS
 
 
-@pytest.mark.parametrize("wrong", ["2190-01-01T00:00:00Z", 5])
+@pytest.mark.parametrize("wrong", ["2190-01-01T00:00:00Z", 5, LATER + 100 + 3600])
 def test_a_sample_of_a_wrong_clock_moves_nothing(client: AppClient, wrong: str | float) -> None:
     send(client, [LATER + k for k in range(100)], [SCALE_K * k * k for k in range(100)])
     calibrate(client)
@@ -250,7 +251,70 @@ def test_a_sample_of_a_wrong_clock_moves_nothing(client: AppClient, wrong: str |
     assert list(residuals(client).values())[-1] == SCALE_K * 199
     found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
     assert found["from"] == "1983-09-10T00:01:40Z"
+    assert ("its clock may be wrong" in "".join(found["notices"])) == (wrong != 5)
     assert counted(client, "twin_assimilated_samples_total") == 101  # nothing was filtered twice
+
+
+def test_once_others_follow_a_lone_sample_takes_part(client: AppClient) -> None:
+    squares(client)
+    send(client, [3600], [290.0])
+    assert len(residuals(client)) == 100
+    send(client, [3601], [291.0])
+    assert list(residuals(client).values())[-2:] == [290.0 - SCALE_K * 99**2, 1.0]
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+    assert found["from"] == "1970-01-01T01:00:01Z" and found["notices"] == ["held the last readings"]
+    sent = [m for m in messages(client) if m["type"] == "residual"]
+    assert [m["time"] for m in sent] == ["1970-01-01T01:00:00Z", "1970-01-01T01:00:01Z"]
+
+
+def messages(client: AppClient) -> list[dict]:
+    """Return every message of the twin's stream."""
+    service = client.app.state.service
+    twin = service.registry.get("benchsat")
+    read = service.database.read
+    arguments = (stream.since_seq, twin.key, twin.channels, twin.sensors, 0, 10_000)
+    return client.portal.call(lambda: read(*arguments))
+
+
+def test_samples_of_a_wrong_past_cost_no_more_than_themselves(client: AppClient) -> None:
+    send(client, [LATER + k for k in range(100)], [SCALE_K * k * k for k in range(100)])
+    calibrate(client)
+    before = residuals(client)
+    for wrong in ([1000 * DAYS, 1000 * DAYS + 1], [1000 * DAYS + 3], [5, 6]):
+        send(client, wrong, [290.0 + k for k in range(len(wrong))])
+        residuals(client)
+    send(client, [LATER + 100], [SCALE_K * 100**2])
+    found = residuals(client)
+    assert len(found) == 106 and {when: found[when] for when in before} == before
+    assert list(found.values())[-1] == SCALE_K * 199
+    assert found["1970-01-01T00:00:06Z"] == 1.0 and found["1972-09-27T00:00:03Z"] == -1.0
+    assert counted(client, "twin_assimilated_samples_total") == 106  # nothing was filtered twice
+    send(client, [LATER + 50.5], [SCALE_K * 50.5**2])  # in the present record everything is as ever
+    assert len(residuals(client)) == 107
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+    assert found["from"] == "1983-09-10T00:01:40Z"
+
+
+def test_late_samples_of_two_records_end_each_in_its_own(client: AppClient) -> None:
+    squares(client)
+    send(client, [LATER + k for k in range(100)], [SCALE_K * k * k for k in range(100)])
+    before = residuals(client)
+    send(client, [50.5, LATER + 50.5], [SCALE_K * 50.5**2] * 2)
+    found = residuals(client)
+    assert len(found) == 202
+    for start in ("1970-01-01", "1983-09-10"):
+        assert found[f"{start}T00:00:50.500000Z"] == SCALE_K * (50.5**2 - 50**2)
+        assert found[f"{start}T00:00:51Z"] == SCALE_K * (51**2 - 50.5**2)
+        assert found[f"{start}T00:01:39Z"] == before[f"{start}T00:01:39Z"]
+
+
+def test_an_anomaly_ends_with_its_record(client: AppClient) -> None:
+    before = lasting(client)
+    send(client, [LATER + k for k in range(30)], [40.0] * 30)
+    residuals(client)
+    (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert anomaly["id"] == before["id"]
+    assert anomaly["stop"] == "1970-01-01T00:02:09Z"
 
 
 def test_after_a_long_gap_the_second_sample_brings_the_first(client: AppClient) -> None:
@@ -260,10 +324,10 @@ def test_after_a_long_gap_the_second_sample_brings_the_first(client: AppClient) 
     send(client, [LATER + 1], [291.0])
     found = residuals(client)
     assert len(found) == 102 and found["1983-09-10T00:00:01Z"] == 1.0
-    send(client, [100, 101], [SCALE_K * 100**2, SCALE_K * 101**2])  # of before the gap: little is done again
+    send(client, [100, 101], [SCALE_K * 100**2, SCALE_K * 101**2])  # of before the gap: nothing is done again
     found = residuals(client)
     assert len(found) == 104 and found["1970-01-01T00:01:41Z"] == SCALE_K * 201
-    assert counted(client, "twin_assimilated_samples_total") == 106
+    assert counted(client, "twin_assimilated_samples_total") == 104
 
 
 def test_a_sample_that_kills_the_worker_is_skipped(client: AppClient) -> None:
