@@ -11,7 +11,7 @@ from service.instants import format_instant
 from service.live import progress
 from service.live.engine import Engine
 from service.live.position import RECENT, Position, is_far, next_count, stretch
-from service.live.progress import Reading, Step
+from service.live.progress import Step
 from service.metrics import Metrics
 from service.problems import Problem
 from service.registry import Entry
@@ -31,6 +31,9 @@ log = logging.getLogger("service.live")
 PAUSE_S = 0.05
 """Shortest time between two steps, so that samples sent one by one are assimilated together."""
 RETRY_S = 2.0
+QUICK_S = 1.0
+"""A return to late samples that took longer is followed by a rest of the same length: a clock that stays wrong costs at
+most half of the time, and what came late meanwhile is taken in at once."""
 _EVER = -(2**62)
 
 
@@ -95,6 +98,9 @@ class Tracker:
         self._read: list[tuple[int, int, int]] = []
         """What was read of the archive, see ``look``."""
         self._detour: _Detour | None = None
+        self._left_s: float | None = None
+        """When the assimilation left the present for late samples; None if it is there."""
+        self._rests_until_s = 0.0
         self._told_seq, self._new_model = 0, True
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
@@ -184,7 +190,7 @@ class Tracker:
         reading = await self._database.read(
             progress.look, self.twin, read, self._told_seq, max(caution.most, 2), active.longest_gap_us, until_us
         )
-        if reading.late_us is not None:
+        if reading.late_us is not None and not self._rests():
             self._caution = _Caution()
             if before is not None and reading.late_us <= before.time_us:
                 await self._go_back(active, before, reading.late_us, reading.until_us)
@@ -197,6 +203,7 @@ class Tracker:
             await self._return(active, detour, reading.seq)
             return True
         if count == 0:
+            self._arrive(reading.late_us is not None)
             self._told_seq, self.catching_up = reading.seq, False
             self._wait(int(time_us[0]) if time_us.size else None)
             return False
@@ -215,11 +222,27 @@ class Tracker:
             return True
         caution.succeeded()
         self.trouble = None
-        await self._keep(active, before, fresh, done, held, reading)
+        seq = before.seq if before is not None and reading.late_us is not None else reading.seq
+        await self._keep(active, before, fresh, done, held, seq, reading.told)
         return True
+
+    def _rests(self) -> bool:
+        """Return whether late samples have to wait, because the last return to such took long."""
+        return self._left_s is None and asyncio.get_running_loop().time() < self._rests_until_s
+
+    def _arrive(self, late: bool) -> None:
+        """Note that the present is reached, and come back to late samples after a rest."""
+        loop = asyncio.get_running_loop()
+        if self._left_s is not None:
+            took_s = loop.time() - self._left_s
+            self._rests_until_s = loop.time() + took_s if took_s > QUICK_S else 0.0
+            self._left_s = None
+        if late:
+            loop.call_at(self._rests_until_s, self._wake.set)
 
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""
+        self._left_s = self._left_s or asyncio.get_running_loop().time()
         if self._detour is not None:
             until_us = self._detour.until_us
         arguments = (self.twin, active.version, late_us, until_us)
@@ -255,7 +278,8 @@ class Tracker:
         fresh: Samples,
         done: Filtered,
         held: dict[str, float],
-        reading: Reading,
+        seq: int,
+        told: NDArray[np.bool_],
     ) -> None:
         """Look for anomalies in an assimilated block and write everything down."""
         time_us = fresh.time_us
@@ -269,8 +293,8 @@ class Tracker:
         changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
         recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
-        after = Position(int(time_us[-1]), reading.seq, count, done.state, held, detector, recent_us)
-        told = reading.told[: time_us.size] | (time_us == self.waits_us)
+        after = Position(int(time_us[-1]), seq, count, done.state, held, detector, recent_us)
+        told = told[: time_us.size] | (time_us == self.waits_us)
         step = Step(
             active.version, before_us, after_gap, time_us, innovation, std, nis, told, changes, after.checkpoint()
         )

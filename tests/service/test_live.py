@@ -308,6 +308,32 @@ def test_late_samples_of_two_records_end_each_in_its_own(client: AppClient) -> N
         assert found[f"{start}T00:01:39Z"] == before[f"{start}T00:01:39Z"]
 
 
+class Slow(FakeWorkbench):
+    """Takes more than a second for what the archive of a test holds."""
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        time.sleep(1.2 if telemetry.time_us.size > 90 else 0.0)
+        return super().assimilate(document, telemetry, state)
+
+
+def test_a_clock_that_stays_wrong_does_not_hold_up_the_present(make_client) -> None:
+    client = make_client(workbench=Slow)
+    client.post("/v1/twins", json=SPEC)
+    squares(client)
+    for k in range(6):
+        send(client, [0.5 + k], [SCALE_K * (0.5 + k) ** 2])
+        send(client, [100 + k], [SCALE_K * (100.0 + k) ** 2])
+        assert f"1970-01-01T00:01:{40 + k}Z" in residuals(client)
+    for _ in range(100):
+        if len(found := residuals(client)) == 112:
+            break
+        time.sleep(0.1)
+    line = np.unique([*np.arange(6) + 0.5, *range(106)])
+    expected = np.diff(SCALE_K * line**2, prepend=0.0)
+    np.testing.assert_array_equal(list(found.values()), expected)
+    assert counted(client, "twin_assimilated_samples_total") < 5 * 100  # each return costs a hundred
+
+
 def test_an_anomaly_ends_with_its_record(client: AppClient) -> None:
     before = lasting(client)
     send(client, [LATER + k for k in range(30)], [40.0] * 30)
