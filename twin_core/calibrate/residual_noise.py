@@ -1,16 +1,20 @@
 """The noise of the real residual: what a model leaves is coloured, and evidence must be weighed in that metric."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
 from twin_core.gp.noise_model import ResidualNoise, fit
 
 SEPARATION = 1.0e3
 """Segments are laid this many record lengths apart, so that their residuals are independent."""
+
+LARGEST_JACOBIAN = 2.5e7
+"""Derivatives held at once, 200 MB; longer records are gone through sensor by sensor."""
 
 
 @dataclass(frozen=True)
@@ -71,3 +75,13 @@ def stacked_jacobian(problem: Problem, blocks: Sequence[FloatArray]) -> FloatArr
         full[first : first + rows[i], :, problem.start_columns(i)] = block[:, :, problem.n_free :]
         first += rows[i]
     return full
+
+
+def sensor_jacobians(problem: Problem, optimum: Optimum) -> Iterator[tuple[int, FloatArray]]:
+    """Yield each sensor with d predicted / d unknowns of all segments, (n_rows, n_unknowns)."""
+    n_sensors = problem.network.sensor_node.size
+    together = max(1, int(LARGEST_JACOBIAN / (problem.n_samples * problem.n_unknowns)))
+    for first in range(0, n_sensors, together):
+        sensors = np.arange(first, min(first + together, n_sensors))
+        jacobian = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit, sensors))
+        yield from ((int(sensor), jacobian[:, column]) for column, sensor in enumerate(sensors))

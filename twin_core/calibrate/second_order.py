@@ -8,6 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
+from twin_core.calibrate.covariance import trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
@@ -15,7 +16,7 @@ from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.outliers import without_outliers
 from twin_core.calibrate.problem import Problem, build_problem
-from twin_core.calibrate.residual_noise import Whitener, fit_whitener, stacked_jacobian
+from twin_core.calibrate.residual_noise import Whitener, fit_whitener
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
 from twin_core.calibrate.statistics import residual_whiteness, score
@@ -38,9 +39,6 @@ HUBER = 1.345
 """Residuals, in units of their noise, beyond which Huber's loss is linear: 95 % efficient where there is no outlier."""
 
 Loss = Literal["squared", "huber"]
-
-LARGEST_JACOBIAN = 2.5e7
-"""Derivatives held at once where the covariance is computed, 200 MB; longer records are gone through sensor by sensor."""
 
 READINGS_PER_UNKNOWN = 2
 """Fewer are refused: any model passes through as many readings as it has unknowns."""
@@ -246,23 +244,6 @@ def _best_start(fit: HeatFit, progress: Progress) -> Optimum:
     return best
 
 
-def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
-    """Return the covariance of the unknowns, (n_unknowns, n_unknowns), in the metric of the coloured residual."""
-    _, std = problem.prior()
-    hessian = np.diag(1.0 / std**2)
-    n_sensors = problem.network.sensor_node.size
-    together = max(1, int(LARGEST_JACOBIAN / (whitener.time_s.size * problem.n_unknowns)))
-    for first in range(0, n_sensors, together):
-        sensors = np.arange(first, min(first + together, n_sensors))
-        blocks = problem.jacobian_blocks(optimum.unknowns, optimum.fit, sensors)
-        jacobian = stacked_jacobian(problem, blocks)
-        for column, sensor in enumerate(sensors):
-            whitened = whitener.whiten(int(sensor), jacobian[:, column])
-            hessian += whitened.T @ whitened
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
-
-
 def to_model(
     calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
 ) -> CalibratedModel:
@@ -271,7 +252,7 @@ def to_model(
     network, spec = calibration.network, calibration.network.spec
     free = None
     if uncertain:
-        free = gls_covariance(problem, optimum, calibration.whitener)[: problem.n_free, : problem.n_free]
+        free = trajectory_covariance(problem, optimum, calibration.whitener)[: problem.n_free, : problem.n_free]
     values = network.parameters.as_dict()
     misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
     return CalibratedModel(

@@ -9,13 +9,14 @@ import numpy as np
 from scipy.stats import chi2
 
 from twin_core._typing import BoolArray, FloatArray
+from twin_core.calibrate.covariance import gls_covariance
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration, from_heat_fit, gls_covariance
+from twin_core.calibrate.second_order import Calibration, from_heat_fit
 from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
 

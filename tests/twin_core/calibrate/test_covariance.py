@@ -1,0 +1,97 @@
+"""The covariance of a fit to trajectories: the textbook's matrices written out, and bands that hold what they should."""
+
+import numpy as np
+import pytest
+
+from tests.helpers import record_of
+from tests.twin_core.calibrate.test_calibrate import STEP_S, TRUTH, declared, exact_K, heat_W, scores
+from tests.twin_core.calibrate.test_outliers import spoilt
+from tests.twin_core.calibrate.test_restricted import dense, noise
+from twin_core.calibrate import calibrate, covariance
+from twin_core.calibrate.covariance import gls_covariance, trajectory_covariance
+from twin_core.calibrate.residual_noise import sensor_jacobians
+from twin_core.calibrate.restricted import ExpectedNoise
+from twin_core.calibrate.second_order import Calibration, fit_trajectories
+from twin_core.network.spec import load_spec
+from twin_core.telemetry import Record
+
+
+def telemetry(seed: int, misfit_K: float = 0.0, length_s: float = 1e4, n_times: int = 300) -> Record:
+    """Return readings of the pair of nodes, whose sensors err by a slow misfit besides their white noise."""
+    rng = np.random.default_rng(seed)
+    time_s, heat = STEP_S * np.arange(n_times), heat_W(n_times, seed)
+    root = np.linalg.cholesky(dense(noise(misfit_K, length_s), time_s))
+    read = exact_K(heat, time_s) + root @ rng.normal(size=(n_times, 2))
+    return record_of(time_s, Q=heat, T_a=read[:, 0], T_b=read[:, 1])
+
+
+def fitted(record: Record, loss: str = "squared") -> Calibration:
+    return fit_trajectories(load_spec(declared()), [record], loss="huber" if loss == "huber" else "squared")
+
+
+def test_it_is_that_of_least_squares_under_the_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Oracle: H^-1 (J' W S W J + P) H^-1 with every matrix in full, a reading missing here and there."""
+    record = telemetry(0, 0.05)
+    record.values["T_b"][40:60] = np.nan
+    done = fitted(record)
+    given = [ExpectedNoise(0.02, ((0.01, 3e3), (0.002, 5e4))), ExpectedNoise(0.03, ())]
+    monkeypatch.setattr(covariance, "restricted_noise", lambda *_: given)
+    problem = done.problem
+    seen = [np.isfinite(record.values[name]) for name in ("T_a", "T_b")]
+    jacobian = dict(sensor_jacobians(problem, done.optimum))
+    weight, hessian = 1.0 / problem.noise_K**2, np.diag(1.0 / problem.prior()[1] ** 2)
+    spread = hessian.copy()
+    for sensor, expected in enumerate(given):
+        rows, time_s = jacobian[sensor][seen[sensor]], record.time_s[seen[sensor]]
+        full = expected.white_K2 * np.eye(time_s.size)
+        for variance, length_s in expected.coloured:
+            full += dense(noise(np.sqrt(variance), length_s, 0.0), time_s)
+        hessian += weight[sensor] * rows.T @ rows
+        spread += weight[sensor] ** 2 * rows.T @ full @ rows
+    oracle = np.linalg.solve(hessian, np.linalg.solve(hessian, spread).T)
+    np.testing.assert_allclose(trajectory_covariance(problem, done.optimum, done.whitener), oracle, rtol=1e-6)
+
+
+def test_under_white_noise_no_estimate_is_more_certain() -> None:
+    """Weighed as it deserves, white noise leaves the certainty of generalised least squares, and little less."""
+    growth = []
+    for seed in range(8):
+        done = fitted(telemetry(seed))
+        arguments = (done.problem, done.optimum, done.whitener)
+        growth.append(np.sqrt(np.diag(trajectory_covariance(*arguments)) / np.diag(gls_covariance(*arguments))))
+    assert np.min(growth) > 0.98
+    assert np.median(growth) < 1.15
+
+
+@pytest.mark.statistical
+def test_the_bands_hold_the_truth_that_a_slow_misfit_has_bent() -> None:
+    """Over draws of a misfit half as large as the noise nine of ten bands of 90 % hold the truth; as it looked, fewer."""
+    pulls, looked = [], []
+    for seed in range(24):
+        record = telemetry(seed, 0.05)
+        model = calibrate(load_spec(declared()), [record])
+        pulls += list(scores(model, TRUTH).values())
+        done = fitted(record)
+        std = np.sqrt(np.diag(gls_covariance(done.problem, done.optimum, done.whitener)))
+        named = dict(zip(model.free_names, std, strict=False))
+        looked += [np.log(model.values[name] / value) / named[name] for name, value in TRUTH.items()]
+    held, held_before = (float(np.mean(np.abs(z) < 1.645)) for z in (pulls, looked))
+    assert 0.82 < held < 0.98
+    assert held_before < held - 0.1
+
+
+def test_readings_that_hubers_loss_holds_back_bend_nothing() -> None:
+    """A tenth of wild readings: the band is near that of the healthy record, not that of the wild readings' spread."""
+    healthy = telemetry(3, n_times=600)
+    rng = np.random.default_rng(3)
+    at = rng.choice(600, 60, replace=False)
+    wild = spoilt(healthy, at, healthy.values["T_a"][at] + rng.choice([-3.0, 3.0], 60))
+
+    def stds(record: Record, loss: str) -> np.ndarray:
+        done = fitted(record, loss)
+        free = trajectory_covariance(done.problem, done.optimum, done.whitener)[: done.problem.n_free]
+        return np.sqrt(np.diag(free))
+
+    growth = stds(wild, "huber") / stds(healthy, "squared")
+    assert 0.9 < growth.min() and growth.max() < 1.6
+    assert (stds(wild, "squared") / stds(healthy, "squared")).max() > 3.0

@@ -1,0 +1,71 @@
+"""How certain the unknowns of a fit are, in the metric of the noise that the fit was made from."""
+
+import numpy as np
+from numba import njit
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.optimise import Optimum
+from twin_core.calibrate.problem import Problem
+from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
+from twin_core.calibrate.restricted import restricted_noise
+
+
+def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
+    """Return the covariance of the unknowns, (n_unknowns, n_unknowns), if the coloured residual were all the noise.
+
+    No estimate could be more certain (Gauss and Markov). It is quick, and enough for a search that asks which of many
+    models tells its parameters at all.
+    """
+    _, std = problem.prior()
+    hessian = np.diag(1.0 / std**2)
+    for sensor, jacobian in sensor_jacobians(problem, optimum):
+        whitened = whitener.whiten(sensor, jacobian)
+        hessian += whitened.T @ whitened
+    return _inverse(hessian)
+
+
+def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
+    """Return the covariance of the unknowns of a fit to trajectories, (n_unknowns, n_unknowns).
+
+    The fit weighs every reading alike, whatever the colour of the misfit, so that its covariance is
+    H⁻¹ (Jᵀ W Σ W J + P) H⁻¹ (Huber 1967): W the weights of the readings, P the priors, H = Jᵀ W J + P, and Σ the noise by
+    restricted likelihood. Readings that Huber's loss holds back pull with what it leaves them, and bend nothing.
+    """
+    _, std = problem.prior()
+    limit_K = problem.huber * problem.noise_K
+    residuals = [np.clip(residual, -limit_K, limit_K) for residual in problem.residuals(optimum.fit)]
+    if np.isfinite(problem.huber):
+        whitener = fit_whitener(problem, residuals)
+    noise = restricted_noise(problem, optimum, whitener, residuals)
+    residual = np.concatenate(residuals)
+    hessian = np.diag(1.0 / std**2)
+    spread = hessian.copy()
+    for sensor, jacobian in sensor_jacobians(problem, optimum):
+        valid = whitener.valid[:, sensor]
+        rows = jacobian[valid] / problem.noise_K[sensor]
+        bends = np.abs(residual[valid, sensor]) < limit_K[sensor]
+        hessian += rows[bends].T @ rows[bends]
+        pull = noise[sensor].white_K2 * rows.T @ rows
+        for variance_K2, length_s in noise[sensor].coloured:
+            crossed = rows.T @ (0.5 * rows + _faded(whitener.time_s[valid], rows, length_s))
+            pull += variance_K2 * (crossed + crossed.T)
+        spread += pull / problem.noise_K[sensor] ** 2
+    inverse = _inverse(hessian)
+    return inverse @ spread @ inverse
+
+
+@njit(cache=True)
+def _faded(time_s: FloatArray, rows: FloatArray, length_s: float) -> FloatArray:
+    """Return for every row the sum of those before it, each times exp(-age / length)."""
+    out = np.zeros_like(rows)
+    for k in range(1, time_s.size):
+        keep = np.exp((time_s[k - 1] - time_s[k]) / length_s)
+        for c in range(rows.shape[1]):
+            out[k, c] = keep * (out[k - 1, c] + rows[k - 1, c])
+    return out
+
+
+def _inverse(hessian: FloatArray) -> FloatArray:
+    """Return the pseudo-inverse, every unknown counted in its own unit."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
+    return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale
