@@ -15,7 +15,8 @@ import pandas as pd
 
 from benchmarks.markdown import markdown_table, save_table
 from twin_core.discover import ClosedLoop, close_loop
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 from twin_core.telemetry_csv import read_csv
 

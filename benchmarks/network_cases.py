@@ -8,7 +8,8 @@ import numpy as np
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_world import NOTHING, SPACE_K, World
 from benchmarks.outside_vocabulary import OUTSIDE
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 TRAINING_SHARE = 0.7

@@ -20,7 +20,8 @@ from twin_core.fem.paper import (
     paper_spec,
 )
 from twin_core.fem.simulate import Simulation, simulate_many
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 TRAIN_ORBITS, ALL_ORBITS = 12.0, 15.0

@@ -8,7 +8,8 @@ import numpy as np
 from benchmarks.markdown import markdown_table
 from twin_core.calibrate import calibrate
 from twin_core.network.model import build_network
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record

@@ -20,7 +20,7 @@ from twin_core.calibrate.windows import balance_of, cut_windows
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.fem.paper import ORBIT_S, paper_spec
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 

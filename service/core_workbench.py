@@ -125,7 +125,7 @@ class CoreWorkbench:
 
 
 def _spec(specification: Json) -> Any:
-    from twin_core.network.spec import load_spec
+    from twin_core.network.spec_io import load_spec
 
     return load_spec(specification)
 

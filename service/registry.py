@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from service.problems import BadField, Problem
 from service.store.twins import Twin
 from twin_core.network.plausible import plausible_range
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 
 
 @dataclass(frozen=True)

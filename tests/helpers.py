@@ -10,7 +10,8 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import evaluate_balance
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
 from twin_core.telemetry import Record
 

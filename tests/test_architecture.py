@@ -126,6 +126,6 @@ def test_clients_do_not_load_the_service() -> None:
 
 
 def test_facades_need_no_compiler() -> None:
-    code = "import sys, twin_core.network.spec, twin_core.telemetry; print('numba' in sys.modules)"
+    code = "import sys, twin_core.network.spec_io, twin_core.telemetry; print('numba' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     assert run.stdout.strip() == "False"

@@ -15,7 +15,7 @@ from service.app import ROUTERS
 from service.settings import Settings
 from twin_core.calibrate import METHODS
 from twin_core.effects import REGISTRY
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 ROOT = Path(__file__).parent.parent

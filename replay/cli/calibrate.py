@@ -32,7 +32,7 @@ def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, loss: s
     from replay.cli.recordings import check_suffix, load_records
     from twin_core.calibrate import calibrate as fit
     from twin_core.files import write_text
-    from twin_core.network.spec import load_spec
+    from twin_core.network.spec_io import load_spec
 
     check_suffix(out, (".json",))
     spec = load_spec(spec_file)

@@ -57,7 +57,7 @@ def close_loop(
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.recordings import check_apart, load_records
     from twin_core.discover import close_loop as run
-    from twin_core.network.spec import load_spec
+    from twin_core.network.spec_io import load_spec
 
     _check(holdout, holdout_telemetry, burn_in, false_alarm_rate, out)
     spec = load_spec(spec_file)

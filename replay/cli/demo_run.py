@@ -23,7 +23,8 @@ from twin_core.fem.hidden.base import WHERE_KEYS
 from twin_core.fem.scenario import Scenario
 from twin_core.fem.simulate import simulate
 from twin_core.files import make_folder, write_text
-from twin_core.network.spec import TwinSpec, dump_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import dump_spec
 
 RECORDING = "orbits.mcap"
 HOLDOUT = 0.3

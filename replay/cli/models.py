@@ -4,7 +4,7 @@ from pathlib import Path
 
 from twin_core.calibrate import CalibratedModel
 from twin_core.errors import SpecError
-from twin_core.network.spec import read_mapping
+from twin_core.network.spec_io import read_mapping
 
 
 def load_model(path: Path) -> CalibratedModel:

@@ -95,7 +95,7 @@ def _send(
     from replay.mapping import apply_mapping, map_topics
     from replay.player import play
     from service.client import ApiError, Unreachable
-    from twin_core.network.spec import load_spec
+    from twin_core.network.spec_io import load_spec
 
     try:
         detail = client.twin(twin)

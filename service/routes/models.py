@@ -10,7 +10,7 @@ from service.jobs import outcome
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
 from service.store import models
 from twin_core import __version__
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 router = APIRouter(prefix="/v1/twins/{twin}/models", tags=["models"])
 

@@ -9,7 +9,7 @@ from service.instants import format_instant
 from service.schemas import TwinDetail, TwinInfo, TwinList
 from service.store import twins
 from service.store.twins import Twin
-from twin_core.network.spec import dump_spec, load_spec
+from twin_core.network.spec_io import dump_spec, load_spec
 
 router = APIRouter(prefix="/v1/twins", tags=["twins"])
 

@@ -18,7 +18,7 @@ from benchmarks.rival_features import FeatureHeat, library, powers
 from benchmarks.rival_residual import rms_error_K
 from twin_core.discover.holdout import split_fraction
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
 from twin_core.telemetry import Record
 

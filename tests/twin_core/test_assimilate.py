@@ -12,7 +12,7 @@ from twin_core.assimilate import FLOOR_SHARE, START_STD_HIDDEN_K, START_STD_SENS
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.kernels import GAMMA
 from twin_core.simulate.rollout import rollout

@@ -6,7 +6,7 @@ import pytest
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects import effect_from_json
 from twin_core.flows import heat_flows
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 SPEC = load_spec(

@@ -14,7 +14,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.forecast import forecast
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 POWER = {"kind": "power", "unit": "W"}

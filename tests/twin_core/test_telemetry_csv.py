@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from twin_core.errors import TelemetryError, TwinError
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 from twin_core.telemetry_csv import read_csv, write_csv
 

@@ -12,7 +12,8 @@ from twin_core.effects import effect_from_json, effect_to_json
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import TwinSpec, dump_spec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import dump_spec, load_spec
 from twin_core.parameters.transforms import Log, is_logarithmic
 
 FORMAT = "thermal-twin-model/1"

@@ -10,7 +10,8 @@ from twin_core.constants import DEEP_SPACE_K, SOLAR_CONSTANT_W_PER_M2
 from twin_core.errors import SpecError
 from twin_core.fem.materials import MATERIALS
 from twin_core.fem.scenario import Scenario, load_scenario
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 
 ORBIT_S = 5700.0
 N_ORBITS = 14

@@ -12,7 +12,8 @@ import numpy as np
 from twin_core.constants import DEEP_SPACE_K
 from twin_core.errors import SpecError
 from twin_core.fem.scenario import Scenario, load_scenario
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 
 CORRELATION_LENGTH_S = {"A": 700.0, "B": 840.0, "C": 560.0}
 """Correlation length of the internal sources of each test (section 5.2)."""

@@ -6,7 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from twin_core.errors import TelemetryError
 from twin_core.fem.signals import AnySignal
-from twin_core.network.spec import Channel, Fraction, Name, Number, Positive, Temperature
+from twin_core.network.quantities import Fraction, Name, Number, Positive, Temperature
+from twin_core.network.spec import Channel
 from twin_core.units import parse_instant_ns
 
 NotNegative = Annotated[Number, Field(ge=0)]

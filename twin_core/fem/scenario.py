@@ -27,7 +27,9 @@ from twin_core.fem.parts import (
 )
 from twin_core.fem.signals import AnySignal
 from twin_core.fem.thermostat import Thermostat
-from twin_core.network.spec import Channel, Name, Positive, Temperature, read_mapping
+from twin_core.network.quantities import Name, Positive, Temperature
+from twin_core.network.spec import Channel
+from twin_core.network.spec_io import read_mapping
 from twin_core.units import parse_instant_ns
 
 MOST_CELLS = 250_000

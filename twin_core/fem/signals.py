@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from twin_core._typing import FloatArray
 from twin_core.constants import EARTH_RADIUS_M
 from twin_core.errors import TelemetryError
-from twin_core.network.spec import Fraction, Number, Positive
+from twin_core.network.quantities import Fraction, Number, Positive
 from twin_core.units import parse_instant_ns
 
 Path = Callable[[FloatArray], FloatArray]

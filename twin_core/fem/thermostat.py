@@ -8,7 +8,8 @@ from pydantic import model_validator
 from twin_core._typing import FloatArray
 from twin_core.fem.parts import Part
 from twin_core.fem.signals import Path
-from twin_core.network.spec import Channel, Name, Positive, Temperature
+from twin_core.network.quantities import Name, Positive, Temperature
+from twin_core.network.spec import Channel
 
 
 class Thermostat(Part):

@@ -9,7 +9,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
-from twin_core.network.spec import Channel, Load, Quantity, TwinSpec, guess_or
+from twin_core.network.quantities import Quantity, guess_or
+from twin_core.network.spec import Channel, Load, TwinSpec
 from twin_core.network.terms import (
     BoundaryConductor,
     CapacityTerm,

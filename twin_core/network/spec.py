@@ -1,78 +1,27 @@
-"""The twin specification: what the operator declares, validated, with one clear message for what is wrong."""
+"""The twin specification: what the operator declares, and whether it fits together."""
 
-import json
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import pairwise
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-import yaml
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StrictBool,
-    ValidationError,
-    field_validator,
-    model_validator,
+from pydantic import Field, StrictBool, field_validator, model_validator
+
+from twin_core.errors import TelemetryError
+from twin_core.network.quantities import (
+    TWIN_ID,
+    Fraction,
+    Magnitude,
+    Name,
+    Number,
+    Positive,
+    Quantity,
+    Strict,
+    Temperature,
 )
-
-from twin_core.errors import SpecError, TelemetryError
 from twin_core.units import parse_instant_ns
 
 
-def _not_boolean(value: Any) -> Any:
-    """Refuse true and false where a number is wanted: Python would take them for 1 and 0."""
-    if isinstance(value, bool):
-        raise ValueError("must be a number, not true or false")
-    return value
-
-
-Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
-Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
-Magnitude = Annotated[
-    float,
-    BeforeValidator(_not_boolean),
-    Field(gt=0, allow_inf_nan=False),
-    Field(ge=1e-12, le=1e15, allow_inf_nan=False),
-]
-"""A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
-Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
-Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
-_NAME = r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$"
-_TWIN_ID = r"^[a-z0-9][a-z0-9-]{0,62}$"
-Name = Annotated[str, Field(pattern=_NAME)]
-
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Quantity(_Strict):
-    """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``)."""
-
-    value: Magnitude | None = None
-    guess: Magnitude | None = None
-    bounds: tuple[Positive, Positive] | None = None
-
-    @model_validator(mode="after")
-    def _one_meaning(self) -> Self:
-        if self.value is not None and (self.guess is not None or self.bounds is not None):
-            raise ValueError(
-                "give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both"
-            )
-        if self.bounds is not None:
-            low, high = self.bounds
-            if not low < high:
-                raise ValueError(f"bounds contradict each other: {low:g} is not below {high:g}")
-            if self.guess is not None and not low <= self.guess <= high:
-                raise ValueError(f"guess {self.guess:g} lies outside its bounds {low:g} to {high:g}")
-        return self
-
-
-class Boundary(_Strict):
+class Boundary(Strict):
     """A temperature that is given: a constant, a telemetry channel, or one unknown constant with a guess."""
 
     value_K: Temperature | None = None
@@ -86,7 +35,7 @@ class Boundary(_Strict):
         return self
 
 
-class Channel(_Strict):
+class Channel(Strict):
     """One telemetry column that the twin uses."""
 
     kind: Literal["temperature", "power", "auxiliary"]
@@ -116,7 +65,7 @@ class Channel(_Strict):
         return self.kind == "power" or self.levels
 
 
-class Node(_Strict):
+class Node(Strict):
     """A lumped thermal mass; without a sensor it is a hidden state."""
 
     id: Name
@@ -131,7 +80,7 @@ class Node(_Strict):
         return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
 
 
-class Conductor(_Strict):
+class Conductor(Strict):
     """A symmetric linear coupling GL (W/K) between two nodes, or a node and a boundary."""
 
     between: tuple[Name, Name]
@@ -145,7 +94,7 @@ class Conductor(_Strict):
         return value
 
 
-class Radiator(_Strict):
+class Radiator(Strict):
     """Declared and known radiation: sigma * emissivity * area * (T_sink^4 - T^4) into the node."""
 
     node: Name
@@ -154,7 +103,7 @@ class Radiator(_Strict):
     sink: Name
 
 
-class Table(_Strict):
+class Table(Strict):
     """Heat as an unknown function of an auxiliary channel: piecewise linear over knots, or one value per level."""
 
     knots: tuple[Number, ...] | None = None
@@ -167,7 +116,7 @@ class Table(_Strict):
         return value
 
 
-class Load(_Strict):
+class Load(Strict):
     """A declared heat input into one node."""
 
     channel: Name
@@ -178,7 +127,7 @@ class Load(_Strict):
     table: Table | None = None
 
 
-class Interval(_Strict):
+class Interval(Strict):
     """An interval that takes no part in any fit or score."""
 
     start: str | Number
@@ -205,17 +154,17 @@ class Interval(_Strict):
         return self
 
 
-class Criteria(_Strict):
+class Criteria(Strict):
     """Correlation acceptance. The defaults are the usual test-correlation goals: 2 K of bias, 5 K for 99 % of samples."""
 
     bias_K: Positive = 2.0
     q99_abs_K: Positive = 5.0
 
 
-class TwinSpec(_Strict):
+class TwinSpec(Strict):
     """The whole specification of a twin (contract section 3)."""
 
-    twin: Annotated[str, Field(pattern=_TWIN_ID)]
+    twin: Annotated[str, Field(pattern=TWIN_ID)]
     boundaries: dict[Name, Boundary] = Field(default_factory=dict)
     channels: dict[Name, Channel]
     nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
@@ -327,150 +276,3 @@ class TwinSpec(_Strict):
     def noise_std_K(self, sensor: str) -> float | None:
         """The declared noise of a sensor in kelvin (a difference: the same number in degC)."""
         return self.channels[sensor].noise_std
-
-
-def _one_line(error: ValidationError) -> str:
-    """Return the first problem of a validation as ``field: what is wrong``."""
-    first = min(error.errors(), key=lambda item: item["type"] == "missing")
-    where = ""
-    for part in first["loc"]:
-        where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
-    message = _wording(first)
-    return f"{where}: {message}" if where else message
-
-
-_WORDING = {
-    "extra_forbidden": "unknown field; remove it or correct its spelling",
-    "missing": "is missing",
-    "model_type": "must be a mapping of fields",
-    "dict_type": "must be a mapping of names",
-    "tuple_type": "must be a list",
-    "too_short": "must hold more entries",
-    "too_long": "must hold fewer entries",
-    "string_type": "must be text",
-    "float_parsing": "must be a number",
-    "float_type": "must be a number",
-    "bool_parsing": "must be true or false",
-    "bool_type": "must be true or false",
-}
-
-
-_PATTERN_WORDING = {
-    _NAME: "is no valid name; begin with a letter or '_' and go on with letters, digits and '_.:/-', 128 at most",
-    _TWIN_ID: "is no valid id; begin with a lower-case letter or digit and go on with those and '-', 63 at most",
-}
-
-
-def _wording(problem: Mapping[str, Any]) -> str:
-    """Return what is wrong in words of the specification rather than of the validator."""
-    kind, given = problem["type"], problem["input"]
-    if kind == "string_pattern_mismatch":
-        message = _PATTERN_WORDING[problem["ctx"]["pattern"]]
-    else:
-        message = _WORDING.get(kind, problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be"))
-    if kind in ("extra_forbidden", "missing", "value_error") or isinstance(given, dict | list):
-        return message
-    shown = repr(given)
-    return f"{message} (got {shown if len(shown) <= 60 else shown[:57] + '...'})"
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """A safe YAML loader that refuses a key that stands twice, where YAML would silently keep the last.
-
-    Times stay text, quoted or not.
-    """
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise SpecError(f"line {node.value[i][0].start_mark.line + 1}: '{key}' stands twice")
-        return super().construct_mapping(node, deep)
-
-
-_UniqueKeys.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object, refusing a key that stands twice."""
-    result = dict(pairs)
-    if len(result) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise SpecError(f"'{next(n for i, n in enumerate(names) if n in names[:i])}' stands twice")
-    return result
-
-
-def read_mapping(path: Path) -> dict[str, Any]:
-    """Read a YAML or JSON file whose top level is a mapping.
-
-    Raises
-    ------
-    SpecError
-        If the file cannot be read, is not YAML or JSON, or is not a mapping.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a text file"
-        raise SpecError(f"{path}: cannot be read ({reason})") from error
-    try:
-        if Path(path).suffix == ".json":
-            data = json.loads(text, object_pairs_hook=_unique)
-        else:
-            data = yaml.load(text, Loader=_UniqueKeys)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f"line {mark.line + 1}: " if mark else ""
-        raise SpecError(
-            f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})"
-        ) from error
-    except json.JSONDecodeError as error:
-        raise SpecError(f"{path}: line {error.lineno}: not valid JSON ({error.msg})") from error
-    except RecursionError as error:
-        raise SpecError(f"{path}: is nested too deeply") from error
-    except SpecError as error:
-        raise SpecError(f"{path}: {error}") from error
-    except ValueError as error:
-        raise SpecError(f"{path}: holds a number of too many digits") from error
-    if not isinstance(data, dict):
-        raise SpecError(f"{path}: the top level must be a mapping of fields, got {type(data).__name__}")
-    return data
-
-
-def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
-    """Return the validated specification from a YAML or JSON file, or from its parsed mapping.
-
-    Raises
-    ------
-    SpecError
-        With one line that names the file and the field, and says what is wrong.
-    """
-    prefix = "" if isinstance(source, dict) else f"{source}: "
-    data = source if isinstance(source, dict) else read_mapping(Path(source))
-    try:
-        return TwinSpec.model_validate(data)
-    except ValidationError as error:
-        raise SpecError(prefix + _one_line(error)) from error
-
-
-def dump_spec(spec: TwinSpec) -> dict[str, Any]:
-    """Return the specification as plain data that ``load_spec`` reads back; absent fields are left out."""
-    return spec.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
-
-
-def guess_or(quantity: Quantity | None, default: float) -> float:
-    """Return the value or guess of a quantity, or ``default`` where neither is declared."""
-    if quantity is None:
-        return default
-    for number in (quantity.value, quantity.guess):
-        if number is not None:
-            return number
-    if quantity.bounds is not None:
-        return math.sqrt(quantity.bounds[0] * quantity.bounds[1])
-    return default
-
-
-__all__ = ["TwinSpec", "dump_spec", "guess_or", "load_spec", "read_mapping"]

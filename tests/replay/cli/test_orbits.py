@@ -20,7 +20,8 @@ from tests.service.server import Server
 from twin_core.fem.demo import ORBIT_S, demo_scenario
 from twin_core.fem.scenario import load_scenario
 from twin_core.fem.simulate import simulate
-from twin_core.network.spec import TwinSpec, dump_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import dump_spec
 from twin_core.telemetry import Record
 
 pytestmark = [pytest.mark.e2e, pytest.mark.slow]

@@ -10,7 +10,8 @@ from replay.cli.recordings import check_apart, load_record, load_records, save_r
 from replay.errors import ReplayError
 from replay.mcap_io import write_mcap
 from twin_core.errors import TelemetryError
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 EPOCH_NS = 1_767_225_600_000_000_000

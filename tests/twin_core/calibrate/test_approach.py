@@ -13,7 +13,7 @@ from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.second_order import prepare
 from twin_core.errors import TelemetryError
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 
 def too_coarse() -> Problem:

@@ -11,7 +11,7 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import record_of
 from twin_core.calibrate import CalibratedModel, calibrate
 from twin_core.errors import Cancelled, ModelError, TelemetryError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 CAPACITY = np.array([4.0e3, 7.0e3])

@@ -12,7 +12,7 @@ from twin_core.calibrate.identifiability import (
     weakest_direction,
     words,
 )
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.parameters.parameter import positive, real
 from twin_core.parameters.vector import ParameterSet
 

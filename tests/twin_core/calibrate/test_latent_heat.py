@@ -17,7 +17,7 @@ from twin_core.calibrate.latent_heat import (
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.kernels import GAMMA
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record

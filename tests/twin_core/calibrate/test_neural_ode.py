@@ -17,7 +17,7 @@ from twin_core.calibrate.windows import balance_of
 from twin_core.errors import ModelError
 from twin_core.forecast import forecast
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.response import sensitivities
 from twin_core.telemetry import Record
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.helpers import record_of
 from twin_core.calibrate.noise import FALLBACK_STD_K, difference_noise_K, quantum_K, sensor_noise_K
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 RNG_SIZE = 4000
 

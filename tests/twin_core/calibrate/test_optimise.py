@@ -12,7 +12,7 @@ from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects import REGISTRY
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 CAPACITY, G, WALL_G, WALL_K, AREA_M2 = np.array([800.0, 1200.0, 1000.0]), np.array([1.0, 1.5]), 2.0, 260.0, 0.2
 TIME_S = 60.0 * np.arange(400)

@@ -11,7 +11,7 @@ from twin_core.calibrate import calibrate
 from twin_core.calibrate.outliers import gross_outliers, without_outliers
 from twin_core.calibrate.second_order import prepare
 from twin_core.errors import ModelError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 

@@ -12,7 +12,7 @@ from tests.helpers import EVERY_TERM, EVERY_TERM_KNOTS, active_effect, every_ter
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects import REGISTRY
 from twin_core.errors import SpecError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 
 def every_model(*names: str) -> CalibratedModel:

@@ -8,7 +8,7 @@ from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.starting import balance_start, channel_levels, filled_columns
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 
 
 def test_levels_are_where_a_channel_rests() -> None:

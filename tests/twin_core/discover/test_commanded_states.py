@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from twin_core.discover import close_loop
 from twin_core.discover.loop import ClosedLoop
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 SPEC: dict[str, Any] = {

@@ -14,7 +14,8 @@ from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import N_BLOCKS, Trial, blocked_errors, try_effects, validate, weigh
 from twin_core.discover.judge import is_valid
 from twin_core.effects import REGISTRY
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 NOISE_K = 0.1

@@ -27,7 +27,8 @@ from twin_core.latent_force.declared import fit_declared
 from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.network.model import build_network
-from twin_core.network.spec import TwinSpec, load_spec
+from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.telemetry import Record
 

@@ -8,7 +8,7 @@ from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.errors import TelemetryError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 CAPACITY_J_PER_K, WALL_W_PER_K, ROOM_K, NOISE_K = 4.0e3, 2.0, 280.0, 0.05

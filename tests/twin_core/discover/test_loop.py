@@ -14,7 +14,7 @@ from twin_core.discover.holdout import predict, split_burn_in
 from twin_core.discover.loop import ClosedLoop
 from twin_core.effects import REGISTRY
 from twin_core.errors import Cancelled, TelemetryError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 CASES = {

@@ -11,7 +11,7 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec
 from twin_core.discover import close_loop
 from twin_core.errors import TelemetryError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 N_TIMES = 120

@@ -11,7 +11,7 @@ from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Search
 from twin_core.discover.witness import NodeHeat, bear_witness, told_by
 from twin_core.errors import ModelError
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 TIMES = np.arange(0.0, 40000.0, 100.0)

@@ -8,7 +8,7 @@ from scipy.special import ndtr
 from tests.helpers import at_named, central_difference, conductive_spec, record_of
 from twin_core.effects import REGISTRY, Effect
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout

@@ -12,7 +12,7 @@ from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.effects import REGISTRY, Effect
 from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout

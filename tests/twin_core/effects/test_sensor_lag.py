@@ -7,7 +7,7 @@ from tests.helpers import conductive_spec, every_term_network, points, record_of
 from twin_core.effects import REGISTRY
 from twin_core.effects.hidden_mass import first_order_lag
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 

@@ -10,7 +10,7 @@ from tests.helpers import at_named, conductive_spec, every_term_network, points,
 from twin_core.effects import REGISTRY
 from twin_core.effects.thermostat_heater import switching
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 
 C, G, POWER_W, ON_K, OFF_K, WALL_K = 4.0e3, 0.6, 60.0, 280.0, 284.0, 250.0

@@ -9,7 +9,7 @@ from twin_core.errors import SpecError
 from twin_core.fem.demo import DEMO_EFFECTS, demo_scenario
 from twin_core.fem.scenario import Scenario, load_scenario
 from twin_core.fem.simulate import Simulation, simulate
-from twin_core.network.spec import dump_spec
+from twin_core.network.spec_io import dump_spec
 
 
 def short(scenario: Scenario, orbits: float = 2.0) -> Scenario:

@@ -11,7 +11,7 @@ from twin_core.gp.kernels import Matern
 from twin_core.latent_force.declared import along_parameters, declared_model, fit_declared
 from twin_core.latent_force.posterior import GammaPrior
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.telemetry import Record
 

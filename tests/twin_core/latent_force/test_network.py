@@ -11,7 +11,7 @@ from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import grid_times_s, linearise_network, on_grid
 from twin_core.latent_force.smooth import smooth_extended
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.telemetry import Record
 

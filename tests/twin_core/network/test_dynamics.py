@@ -13,7 +13,7 @@ from tests.helpers import active_effect, central_difference, conductive_spec, ev
 from twin_core.effects import REGISTRY
 from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
 
 N_POINTS = 60

@@ -9,7 +9,7 @@ from tests.helpers import EVERY_TERM, EVERY_TERM_KNOTS, every_term_network
 from twin_core.effects import REGISTRY
 from twin_core.errors import ModelError
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from twin_core.errors import SpecError
-from twin_core.network.spec import dump_spec, guess_or, load_spec
+from twin_core.network.quantities import guess_or
+from twin_core.network.spec_io import dump_spec, load_spec
 
 FULL = """
 twin: benchsat

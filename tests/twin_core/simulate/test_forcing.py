@@ -9,7 +9,7 @@ import pytest
 from tests.helpers import record_of
 from twin_core.errors import TelemetryError
 from twin_core.network.model import build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.kernels import GAMMA
 from twin_core.telemetry import Record

@@ -20,7 +20,7 @@ from tests.helpers import (
 )
 from twin_core.effects import REGISTRY
 from twin_core.network.model import Network, build_network
-from twin_core.network.spec import load_spec
+from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.response import sensitivities
 from twin_core.simulate.rollout import Rollout, rollout

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Protocol
 from pydantic import BaseModel, ConfigDict
 
 from twin_core._typing import FloatArray
-from twin_core.network.spec import Number
+from twin_core.network.quantities import Number
 from twin_core.units import parse_instant_ns
 
 WHERE_KEYS = ("node", "nodes", "sink", "boundary", "channel", "sensor")

@@ -5,7 +5,7 @@ from typing import Literal
 
 from twin_core._typing import FloatArray
 from twin_core.fem.hidden.base import Bound, Declared, HiddenEffect, Instant, Moment, Plant, seconds
-from twin_core.network.spec import Name, Number, Positive, Temperature
+from twin_core.network.quantities import Name, Number, Positive, Temperature
 
 
 def _unjoined(nodes: tuple[str, str], declared: Declared) -> Iterable[str]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.fem.hidden.base import LumpedHeat, Moment
-from twin_core.network.spec import Name, Positive
+from twin_core.network.quantities import Name, Positive
 
 
 class RadiationToSink(LumpedHeat):

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import model_validator
 
 from twin_core.fem.hidden.base import Bound, Declared, LumpedHeat, Moment, Plant, spread
-from twin_core.network.spec import Name, Number, Positive, Temperature
+from twin_core.network.quantities import Name, Number, Positive, Temperature
 
 
 class ConstantHeatLoad(LumpedHeat):

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.fem.hidden.base import HiddenEffect, Instant, seconds
-from twin_core.network.spec import Name, Number, Positive
+from twin_core.network.quantities import Name, Number, Positive
 
 
 class InputGain(HiddenEffect):

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from twin_core.fem.hidden.base import Bound, HiddenEffect, LumpedHeat, Mass, Moment, Plant, spread
-from twin_core.network.spec import Name, Number, Positive, Temperature
+from twin_core.network.quantities import Name, Number, Positive, Temperature
 
 
 class HiddenMass(HiddenEffect):

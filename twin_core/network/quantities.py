@@ -1,0 +1,69 @@
+"""What a specification is made of: numbers within limits, names, and quantities that are known or to be found."""
+
+import math
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+
+def _not_boolean(value: Any) -> Any:
+    """Refuse true and false where a number is wanted: Python would take them for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("must be a number, not true or false")
+    return value
+
+
+Number = Annotated[float, BeforeValidator(_not_boolean), Field(allow_inf_nan=False)]
+Positive = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, allow_inf_nan=False)]
+Magnitude = Annotated[
+    float,
+    BeforeValidator(_not_boolean),
+    Field(gt=0, allow_inf_nan=False),
+    Field(ge=1e-12, le=1e15, allow_inf_nan=False),
+]
+"""A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
+Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
+Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
+NAME = r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$"
+TWIN_ID = r"^[a-z0-9][a-z0-9-]{0,62}$"
+Name = Annotated[str, Field(pattern=NAME)]
+
+
+class Strict(BaseModel):
+    """Declared fields only, which never change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(Strict):
+    """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``)."""
+
+    value: Magnitude | None = None
+    guess: Magnitude | None = None
+    bounds: tuple[Positive, Positive] | None = None
+
+    @model_validator(mode="after")
+    def _one_meaning(self) -> Self:
+        if self.value is not None and (self.guess is not None or self.bounds is not None):
+            raise ValueError(
+                "give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both"
+            )
+        if self.bounds is not None:
+            low, high = self.bounds
+            if not low < high:
+                raise ValueError(f"bounds contradict each other: {low:g} is not below {high:g}")
+            if self.guess is not None and not low <= self.guess <= high:
+                raise ValueError(f"guess {self.guess:g} lies outside its bounds {low:g} to {high:g}")
+        return self
+
+
+def guess_or(quantity: Quantity | None, default: float) -> float:
+    """Return the value or guess of a quantity, or ``default`` where neither is declared."""
+    if quantity is None:
+        return default
+    for number in (quantity.value, quantity.guess):
+        if number is not None:
+            return number
+    if quantity.bounds is not None:
+        return math.sqrt(quantity.bounds[0] * quantity.bounds[1])
+    return default

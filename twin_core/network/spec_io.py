@@ -1,0 +1,145 @@
+"""Specifications as files and plain data, with one clear message for what is wrong."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from twin_core.errors import SpecError
+from twin_core.network.quantities import NAME, TWIN_ID
+from twin_core.network.spec import TwinSpec
+
+
+def _one_line(error: ValidationError) -> str:
+    """Return the first problem of a validation as ``field: what is wrong``."""
+    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+    where = ""
+    for part in first["loc"]:
+        where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
+    message = _wording(first)
+    return f"{where}: {message}" if where else message
+
+
+_WORDING = {
+    "extra_forbidden": "unknown field; remove it or correct its spelling",
+    "missing": "is missing",
+    "model_type": "must be a mapping of fields",
+    "dict_type": "must be a mapping of names",
+    "tuple_type": "must be a list",
+    "too_short": "must hold more entries",
+    "too_long": "must hold fewer entries",
+    "string_type": "must be text",
+    "float_parsing": "must be a number",
+    "float_type": "must be a number",
+    "bool_parsing": "must be true or false",
+    "bool_type": "must be true or false",
+}
+
+
+_PATTERN_WORDING = {
+    NAME: "is no valid name; begin with a letter or '_' and go on with letters, digits and '_.:/-', 128 at most",
+    TWIN_ID: "is no valid id; begin with a lower-case letter or digit and go on with those and '-', 63 at most",
+}
+
+
+def _wording(problem: Mapping[str, Any]) -> str:
+    """Return what is wrong in words of the specification rather than of the validator."""
+    kind, given = problem["type"], problem["input"]
+    if kind == "string_pattern_mismatch":
+        message = _PATTERN_WORDING[problem["ctx"]["pattern"]]
+    else:
+        message = _WORDING.get(kind, problem["msg"].removeprefix("Value error, ").replace("Input should be", "must be"))
+    if kind in ("extra_forbidden", "missing", "value_error") or isinstance(given, dict | list):
+        return message
+    shown = repr(given)
+    return f"{message} (got {shown if len(shown) <= 60 else shown[:57] + '...'})"
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """A safe YAML loader that refuses a key that stands twice, where YAML would silently keep the last.
+
+    Times stay text, quoted or not.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                raise SpecError(f"line {node.value[i][0].start_mark.line + 1}: '{key}' stands twice")
+        return super().construct_mapping(node, deep)
+
+
+_UniqueKeys.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object, refusing a key that stands twice."""
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise SpecError(f"'{next(n for i, n in enumerate(names) if n in names[:i])}' stands twice")
+    return result
+
+
+def read_mapping(path: Path) -> dict[str, Any]:
+    """Read a YAML or JSON file whose top level is a mapping.
+
+    Raises
+    ------
+    SpecError
+        If the file cannot be read, is not YAML or JSON, or is not a mapping.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a text file"
+        raise SpecError(f"{path}: cannot be read ({reason})") from error
+    try:
+        if Path(path).suffix == ".json":
+            data = json.loads(text, object_pairs_hook=_unique)
+        else:
+            data = yaml.load(text, Loader=_UniqueKeys)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f"line {mark.line + 1}: " if mark else ""
+        raise SpecError(
+            f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})"
+        ) from error
+    except json.JSONDecodeError as error:
+        raise SpecError(f"{path}: line {error.lineno}: not valid JSON ({error.msg})") from error
+    except RecursionError as error:
+        raise SpecError(f"{path}: is nested too deeply") from error
+    except SpecError as error:
+        raise SpecError(f"{path}: {error}") from error
+    except ValueError as error:
+        raise SpecError(f"{path}: holds a number of too many digits") from error
+    if not isinstance(data, dict):
+        raise SpecError(f"{path}: the top level must be a mapping of fields, got {type(data).__name__}")
+    return data
+
+
+def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
+    """Return the validated specification from a YAML or JSON file, or from its parsed mapping.
+
+    Raises
+    ------
+    SpecError
+        With one line that names the file and the field, and says what is wrong.
+    """
+    prefix = "" if isinstance(source, dict) else f"{source}: "
+    data = source if isinstance(source, dict) else read_mapping(Path(source))
+    try:
+        return TwinSpec.model_validate(data)
+    except ValidationError as error:
+        raise SpecError(prefix + _one_line(error)) from error
+
+
+def dump_spec(spec: TwinSpec) -> dict[str, Any]:
+    """Return the specification as plain data that ``load_spec`` reads back; absent fields are left out."""
+    return spec.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
