@@ -9,6 +9,9 @@ from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
 from twin_core.calibrate.restricted import restricted_noise
 
+FARTHEST = 10.0
+"""No logarithm is followed further: a factor of twenty thousand."""
+
 
 def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
     """Return the covariance of the unknowns, (n_unknowns, n_unknowns), if the coloured residual were all the noise.
@@ -52,6 +55,21 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
         spread += pull / problem.noise_K[sensor] ** 2
     inverse = _inverse(hessian)
     return inverse @ spread @ inverse
+
+
+def upward_reach(problem: Problem, optimum: Optimum, position: int, std: float) -> float:
+    """Return how far up an unknown may move alone before the cost has risen by a half, at least ``std``.
+
+    A limit that the readings just touch has a slope on one side only: down the fit suffers, up nothing changes.
+    """
+    reach, step = std, std
+    while 0.0 < step < FARTHEST:
+        moved = optimum.unknowns.copy()
+        moved[position] += step
+        if not problem.solve(moved, optimum.fit).cost < optimum.fit.cost + 0.5:
+            break
+        reach, step = step, 2.0 * step
+    return reach
 
 
 @njit(cache=True)

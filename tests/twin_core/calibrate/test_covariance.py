@@ -3,16 +3,21 @@
 import numpy as np
 import pytest
 
-from tests.helpers import record_of
+from tests.helpers import at_named, record_of
 from tests.twin_core.calibrate.test_calibrate import STEP_S, TRUTH, declared, exact_K, heat_W, scores
 from tests.twin_core.calibrate.test_outliers import spoilt
 from tests.twin_core.calibrate.test_restricted import dense, noise
 from twin_core.calibrate import calibrate, covariance
 from twin_core.calibrate.covariance import gls_covariance, trajectory_covariance
-from twin_core.calibrate.residual_noise import sensor_jacobians
+from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.residual_noise import fit_whitener, sensor_jacobians
 from twin_core.calibrate.restricted import ExpectedNoise
-from twin_core.calibrate.second_order import Calibration, fit_trajectories
-from twin_core.network.spec import load_spec
+from twin_core.calibrate.second_order import Calibration, fit_trajectories, prepare, to_model
+from twin_core.effects.proportional_heater import ProportionalHeater
+from twin_core.network.model import build_network
+from twin_core.network.spec_io import load_spec
+from twin_core.simulate.forcing import build_forcing
+from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
 
@@ -95,3 +100,29 @@ def test_readings_that_hubers_loss_holds_back_bend_nothing() -> None:
     growth = stds(wild, "huber") / stds(healthy, "squared")
     assert 0.9 < growth.min() and growth.max() < 1.6
     assert (stds(wild, "squared") / stds(healthy, "squared")).max() > 3.0
+
+
+def heated(limit_W: float, seed: int) -> tuple[Record, ProportionalHeater]:
+    """Return readings of the pair with a heater of 2 W/K, whose coldest moment asks for some 12 W."""
+    heat, time_s = heat_W(300, 0), STEP_S * np.arange(300)
+    heater = ProportionalHeater({"node": "b"}, {"k_W_per_K": 2.0, "T_set_K": 290.0, "Q_W": limit_W})
+    network = at_named(build_network(load_spec(declared()), [heater]), TRUTH)
+    forcing = build_forcing(network, record_of(time_s, Q=heat), STEP_S)
+    path = rollout(network, network.parameters.values, np.array([284.0, 284.0]), forcing)
+    read = path.at_samples(np.arange(300)) + np.random.default_rng(seed).normal(0.0, 0.1, (300, 2))
+    return record_of(time_s, Q=heat, T_a=read[:, 0], T_b=read[:, 1]), heater
+
+
+@pytest.mark.parametrize(("limit_W", "is_told"), [(20.0, False), (6.0, True)])
+def test_a_limit_that_was_hardly_reached_is_open_ended(limit_W: float, is_told: bool) -> None:
+    """The fit ends where its limit cuts off a peak or two, by chance of the noise: it may be any above."""
+    record, heater = heated(limit_W, 1)
+    start = heater.with_values({"Q_W": min(limit_W, 10.8)})
+    problem, step_s = prepare(load_spec(declared()), [record], [start])
+    problem = problem.with_network(at_named(problem.network, TRUTH))
+    optimum = minimise(problem, problem.start())
+    done = Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step_s)
+    row = next(p for p in to_model(done, [start]).summary["parameters"] if p["name"].endswith("Q_W"))
+    assert row["identified"] == is_told
+    assert (row["std"] < 0.1 * row["mean"]) == is_told
+    assert abs(row["mean"] - limit_W) < 1.645 * row["std"]
