@@ -7,7 +7,10 @@ from twin_core._typing import FloatArray
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
-from twin_core.calibrate.restricted import restricted_noise
+from twin_core.calibrate.restricted import restricted_noise, told_directions
+
+UNTOLD = 1e-13
+"""Combinations of unknowns that readings and priors tell less than this share of the best are lost to rounding."""
 
 FARTHEST = 10.0
 """No logarithm is followed further: a factor of twenty thousand."""
@@ -24,7 +27,8 @@ def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> Fl
     for sensor, jacobian in sensor_jacobians(problem, optimum):
         whitened = whitener.whiten(sensor, jacobian)
         hessian += whitened.T @ whitened
-    return _inverse(hessian)
+    directions = told_directions(hessian, UNTOLD)
+    return directions @ directions.T
 
 
 def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
@@ -41,11 +45,12 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
         whitener = fit_whitener(problem, residuals)
     noise = restricted_noise(problem, optimum, whitener, residuals)
     residual = np.concatenate(residuals)
-    hessian = np.diag(1.0 / std**2)
+    turned = told_directions(optimum.hessian, UNTOLD)  # in which nothing is lost to rounding
+    hessian = turned.T @ (turned / std[:, None] ** 2)
     spread = hessian.copy()
     for sensor, jacobian in sensor_jacobians(problem, optimum):
         valid = whitener.valid[:, sensor]
-        rows = jacobian[valid] / problem.noise_K[sensor]
+        rows = jacobian[valid] @ turned / problem.noise_K[sensor]
         bends = np.abs(residual[valid, sensor]) < limit_K[sensor]
         hessian += rows[bends].T @ rows[bends]
         pull = noise[sensor].white_K2 * rows.T @ rows
@@ -53,8 +58,8 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
             crossed = rows.T @ (0.5 * rows + _faded(whitener.time_s[valid], rows, length_s))
             pull += variance_K2 * (crossed + crossed.T)
         spread += pull / problem.noise_K[sensor] ** 2
-    inverse = _inverse(hessian)
-    return inverse @ spread @ inverse
+    least_squares = np.linalg.solve(hessian, turned.T)
+    return np.asarray(least_squares.T @ spread @ least_squares)
 
 
 def upward_reach(problem: Problem, optimum: Optimum, position: int, std: float) -> float:
@@ -81,9 +86,3 @@ def _faded(time_s: FloatArray, rows: FloatArray, length_s: float) -> FloatArray:
         for c in range(rows.shape[1]):
             out[k, c] = keep * (out[k - 1, c] + rows[k - 1, c])
     return out
-
-
-def _inverse(hessian: FloatArray) -> FloatArray:
-    """Return the pseudo-inverse, every unknown counted in its own unit."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-30))
-    return np.linalg.pinv(hessian * scale[:, None] * scale, rcond=1e-13, hermitian=True) * scale[:, None] * scale

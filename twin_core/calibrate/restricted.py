@@ -29,7 +29,10 @@ SWEEPS = 3
 """Times that each sensor's misfit is weighed beside the likeliest of the others."""
 
 UNTOLD = 1e-10
-"""Combinations of unknowns that readings and priors tell less than this share of what they tell each have no say."""
+"""Combinations of unknowns that readings and priors tell less than this share of the best have no say."""
+
+LEAST_LIKELY = 1e-3
+"""Misfits of less than this probability are left out of the average."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,8 @@ def _average(options: Sequence[ResidualNoise], shares: FloatArray) -> ExpectedNo
     """Return the mean covariance; parts of one length are one part."""
     variances: dict[float, float] = {}
     for model, share in zip(options, shares.tolist(), strict=True):
+        if share < LEAST_LIKELY:
+            continue
         variances[model.length_s] = variances.get(model.length_s, 0.0) + share * model.sigma_ou**2
     return ExpectedNoise(options[0].sigma_white ** 2, tuple((v, length) for length, v in variances.items() if v > 0.0))
 
@@ -201,10 +206,18 @@ def _told(left: Sequence[Leftover], prior: FloatArray, models: Sequence[Residual
         replace(model, sigma_ou=0.0, sigma_white=float(np.hypot(model.sigma_ou, model.sigma_white))) for model in models
     ]
     _, products = _sum([part.weigh(model) for part, model in zip(left, white, strict=True)], prior)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(products)[:-1], 1e-300))
-    told, directions = np.linalg.eigh(products[:-1, :-1] * scale[:, None] * scale)
-    kept = told > UNTOLD
-    turned = np.zeros((scale.size + 1, int(kept.sum()) + 1))
-    turned[:-1, :-1] = scale[:, None] * directions[:, kept] / np.sqrt(told[kept])
-    turned[-1, -1] = 1.0
+    directions = told_directions(products[:-1, :-1], UNTOLD)
+    turned = np.zeros((directions.shape[0] + 1, directions.shape[1] + 1))
+    turned[:-1, :-1], turned[-1, -1] = directions, 1.0
     return turned
+
+
+def told_directions(hessian: FloatArray, least: float) -> FloatArray:
+    """Return combinations of unknowns that a Hessian tells independently and to one each, (n_unknowns, n_told).
+
+    Those that it tells less than ``least`` of what it tells the best, each unknown counted in its own unit, are left out.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    told, directions = np.linalg.eigh(hessian * scale[:, None] * scale)
+    kept = told > least * told[-1]
+    return np.asarray(scale[:, None] * directions[:, kept] / np.sqrt(told[kept]))

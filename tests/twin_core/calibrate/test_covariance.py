@@ -126,3 +126,15 @@ def test_a_limit_that_was_hardly_reached_is_open_ended(limit_W: float, is_told: 
     assert row["identified"] == is_told
     assert (row["std"] < 0.1 * row["mean"]) == is_told
     assert abs(row["mean"] - limit_W) < 1.645 * row["std"]
+
+
+def test_what_only_the_guesses_tell_keeps_their_uncertainty() -> None:
+    """Capacity, conductance and gain may grow by one factor unseen: along it the variance is that of the guesses, 1."""
+    data = declared()
+    data["loads"] = [{"channel": "Q", "node": "a", "gain": {"guess": 1.2}}]
+    model = calibrate(load_spec(data), [telemetry(0, 0.05)])
+    together = np.array([name[:2] in ("C:", "G:", "ga") for name in model.free_names]) / np.sqrt(len(model.free_names))
+    smallest = np.linalg.eigvalsh(model.covariance)[0]
+    np.testing.assert_allclose(model.covariance, model.covariance.T, rtol=1e-9, atol=1e-12)
+    assert smallest > 0.0
+    assert together @ model.covariance @ together == pytest.approx(1.0, rel=0.02)
