@@ -113,6 +113,7 @@ def create_app(
         lifespan=lifespan,
         docs_url=None,  # by a route of our own, with files of our own
         redoc_url=None,
+        telemetry={"tracing": False, "metrics": False, "logs": False},  # there are metrics of our own
         description="A digital twin of a spacecraft's temperatures that knows what it does not know.",
     )
     problems.install(app)

@@ -59,7 +59,8 @@ class Bodies:
                     parts.append(part)
                     if size > self._max_bytes:
                         break
-                    deadline.reschedule(started + self._timeout_s + size / LEAST_RATE_BYTES_PER_S)
+                    if more:
+                        deadline.reschedule(started + self._timeout_s + size / LEAST_RATE_BYTES_PER_S)
         except TimeoutError:
             raise Problem(408, f"the body did not arrive within {self._timeout_s:g} s") from None
         if size > self._max_bytes:

@@ -20,7 +20,7 @@ from service.registry import Entry
 from service.store import samples
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
 from service.store.samples import Receipt
-from service.streams import Hub, Outcome
+from service.streams import Hub, settle
 
 OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT}
 
@@ -39,44 +39,38 @@ class Intake:
         """Tell streams, trackers and metrics what was stored."""
         self._hub, self._live, self._metrics = hub, live, metrics
         self._loop = asyncio.get_running_loop()
-        self._waiting: dict[int, list[_Ticket]] = {}
-        """Of each twin with a commit under way: what waits for it."""
+        self._lines: dict[int, list[_Ticket]] = {}
+        """Of each twin with a commit under way or about to begin: what waits for the next one."""
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
         ticket = _Ticket(batch, self._loop.create_future())
-        if twin.key in self._waiting:
-            self._waiting[twin.key].append(ticket)
-        else:
-            self._begin(twin, [ticket])
+        if twin.key not in self._lines:
+            self._lines[twin.key] = []
+            self._loop.call_soon(self._begin, twin)  # with what else the loop has at hand
+        self._lines[twin.key].append(ticket)
         return await ticket.receipt
 
-    def _begin(self, twin: Entry, tickets: list[_Ticket]) -> None:
-        """Hand batches to the writer as one."""
-        self._waiting[twin.key] = []
-        batch = _joined([ticket.batch for ticket in tickets])
-        self._hub.submit_then(partial(self._done, twin, tickets), twin.key, _append, twin, batch)
+    def _begin(self, twin: Entry) -> None:
+        """Hand what waits to the writer as one batch."""
+        tickets, self._lines[twin.key] = self._lines[twin.key], []
+        if tickets:
+            batch = _joined([ticket.batch for ticket in tickets])
+            self._hub.submit_then(partial(self._done, twin, tickets), twin.key, _append, twin, batch)
+        else:
+            del self._lines[twin.key]
 
-    def _done(self, twin: Entry, tickets: list[_Ticket], outcome: Outcome[Receipt]) -> None:
-        """Begin with what waited meanwhile, and hand out the receipts; callers may have gone."""
-        waiting = self._waiting.pop(twin.key)
-        if waiting:
-            self._begin(twin, waiting)
-        error = outcome.exception()
-        if error is not None:
-            for ticket in tickets:
-                if not ticket.receipt.done():
-                    ticket.receipt.set_exception(error)
-            return
-        receipt = outcome.result()[0]
-        self._tell(twin, receipt)
+    def _done(self, twin: Entry, tickets: list[_Ticket], receipt: Receipt, error: BaseException | None) -> None:
+        """Hand out the receipts, and begin anew with what came meanwhile."""
+        if error is None:
+            self._tell(twin, receipt)
         first = 0
         for ticket in tickets:
             stop = first + ticket.batch.time_us.size
-            if not ticket.receipt.done():
-                own = receipt if len(tickets) == 1 else replace(receipt, status=receipt.status[first:stop])
-                ticket.receipt.set_result(own)
+            alone = error is not None or len(tickets) == 1
+            settle(ticket.receipt, receipt if alone else replace(receipt, status=receipt.status[first:stop]), error)
             first = stop
+        self._loop.call_soon(self._begin, twin)
 
     def _tell(self, twin: Entry, receipt: Receipt) -> None:
         counts = receipt.counts

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterable
+from functools import cache
 from http import HTTPMethod
 
 from prometheus_client import (
@@ -78,7 +79,8 @@ class Observe:
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         """Count into ``metrics``."""
-        self._app, self._metrics = app, metrics
+        self._app = app
+        self._requests, self._duration_s = cache(metrics.requests.labels), cache(metrics.duration_s.labels)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on and note its status."""
@@ -99,5 +101,5 @@ class Observe:
         finally:
             route = getattr(scope.get("route"), "path", "other")
             method = scope["method"] if scope["method"] in METHODS else "other"
-            self._metrics.requests.labels(method, route, str(status)).inc()
-            self._metrics.duration_s.labels(route).observe(time.perf_counter() - started_s)
+            self._requests(method, route, str(status)).inc()
+            self._duration_s(route).observe(time.perf_counter() - started_s)

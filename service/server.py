@@ -1,6 +1,7 @@
 """The running server: the application behind uvicorn, shut down without losing what was acknowledged."""
 
 import contextlib
+import gc
 import logging
 import os
 import socket
@@ -108,5 +109,7 @@ class _Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
+        gc.collect()
+        gc.freeze()  # what is there now stays: looking through it again and again costs milliseconds each time
         if not self.should_exit and self._on_ready is not None:
             self._on_ready(self._url)

@@ -7,7 +7,7 @@ memory or else from the store, and a reader that lags too far is told so and mov
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
-from concurrent.futures import Future
+from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.messages import Json, Stretch, dropped
@@ -18,8 +18,10 @@ from service.store.database import Database
 
 P = ParamSpec("P")
 T = TypeVar("T")
-Outcome = Future[tuple[T, Sequence[Stretch]]]
-"""What came of a write that makes messages: its result and those messages, or an error."""
+Made = tuple[T, Sequence[Stretch]]
+"""What a write returns that makes messages: its result and those messages."""
+Then = Callable[[T, BaseException | None], None]
+"""Who hears the result of a write, or the error that it ended with."""
 
 IN_MEMORY = 1000
 """Messages of each twin that are kept in memory; readers that lag further behind are served from the store."""
@@ -74,7 +76,7 @@ class Hub:
         self._database, self._metrics, self._buffer = database, metrics, buffer
         self._loop = asyncio.get_running_loop()
         self._topics: dict[int, Topic] = {}
-        self._outcomes: deque[tuple[int, Outcome[Any], Callable[[Outcome[Any]], None]]] = deque()
+        self._outcomes: deque[tuple[int, Then[Any], Made[Any], BaseException | None]] = deque()
 
     def open(self, twin: int, head: int) -> None:
         """Start the stream of a twin."""
@@ -98,7 +100,7 @@ class Hub:
     def submit(
         self,
         twin: int,
-        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        operation: Callable[Concatenate[Any, P], Made[T]],
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> None:
@@ -107,53 +109,45 @@ class Hub:
 
     def submit_then(
         self,
-        then: Callable[["Outcome[T]"], None],
+        then: Then[T],
         twin: int,
-        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        operation: Callable[Concatenate[Any, P], Made[T]],
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> None:
         """The same, and let somebody hear in the event loop what came of it."""
-        answer = self._database.submit(operation, *args, **kwargs)
-        answer.add_done_callback(lambda done: self._after_commit(twin, done, then))
+        self._database.submit_then(partial(self._after_commit, twin, then), operation, *args, **kwargs)
 
-    def _after_commit(self, twin: int, done: "Outcome[Any]", then: Callable[["Outcome[Any]"], None]) -> None:
+    def _after_commit(self, twin: int, then: Then[Any], made: Made[Any], error: BaseException | None) -> None:
         """Hand an outcome to the event loop; the writer calls this in the order of the commits.
 
         Waking the loop costs as much as a small write, so it is woken once for all that is handed over meanwhile.
         """
-        self._outcomes.append((twin, done, then))
+        self._outcomes.append((twin, then, made, error))
         if len(self._outcomes) == 1 and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take_outcomes)
 
     def _take_outcomes(self) -> None:
         """Publish what was committed, then let those who wait go on; in the event loop."""
         while self._outcomes:
-            twin, done, then = self._outcomes.popleft()
-            if done.exception() is None:
-                self.publish(twin, done.result()[1])
-            then(done)
+            twin, then, made, error = self._outcomes.popleft()
+            if error is not None:
+                then(None, error)
+                continue
+            result, stretches = made
+            self.publish(twin, stretches)
+            then(result, None)
 
     async def write(
         self,
         twin: int,
-        operation: Callable[Concatenate[Any, P], tuple[T, Sequence[Stretch]]],
+        operation: Callable[Concatenate[Any, P], Made[T]],
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> T:
         """Return the result of a write that makes messages, once it is committed."""
         waiter: asyncio.Future[T] = self._loop.create_future()
-
-        def then(done: Outcome[T]) -> None:
-            if waiter.done():  # its caller may have gone
-                return
-            error = done.exception()
-            if error is None:
-                waiter.set_result(done.result()[0])
-            else:
-                waiter.set_exception(error)
-
-        self.submit_then(then, twin, operation, *args, **kwargs)
+        self.submit_then(partial(settle, waiter), twin, operation, *args, **kwargs)
         return await waiter
 
     async def follow(self, twin: Entry, after_seq: int | None) -> AsyncIterator[list[Json]]:
@@ -202,7 +196,17 @@ class Hub:
         return [dropped(position + 1, last)], last
 
 
-def _ignore(_: Outcome[Any]) -> None:
+def settle(waiter: "asyncio.Future[T]", result: T, error: BaseException | None) -> None:
+    """Let a waiter go on, unless it has gone."""
+    if waiter.done():
+        return
+    if error is not None:
+        waiter.set_exception(error)
+    else:
+        waiter.set_result(result)
+
+
+def _ignore(_: Any, error: BaseException | None) -> None:
     """Want to hear nothing."""
 
 

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -39,12 +40,12 @@ PRAGMAS = (
 FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
 
 
-@dataclass
+@dataclass(slots=True)
 class _Order:
     """One operation on its way to the writer, and where its result goes."""
 
     operation: Callable[[sqlite3.Connection], Any]
-    answer: "Future[Any]"
+    then: Callable[[Any, BaseException | None], None]
     result: Any = None
     error: BaseException | None = None
 
@@ -79,8 +80,18 @@ class Database:
     ) -> "Future[T]":
         """Queue an operation for the writer, from any thread."""
         answer: Future[T] = Future()
-        self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), answer))
+        self.submit_then(partial(_settle, answer), operation, *args, **kwargs)
         return answer
+
+    def submit_then(
+        self,
+        then: Callable[[T, BaseException | None], None],
+        operation: Callable[Concatenate[sqlite3.Connection, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """The same; after the commit the writer calls ``then`` with the result, or with the error."""
+        self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), then))
 
     async def read(
         self, operation: Callable[Concatenate[sqlite3.Connection, P], T], *args: P.args, **kwargs: P.kwargs
@@ -151,7 +162,7 @@ class Database:
             for order in orders:
                 order.error = order.error or _refusal(error)
         for order in orders:
-            _answer(order)
+            order.then(order.result, order.error)
 
     def _commit_together(self, orders: list[_Order]) -> bool:
         """Return whether all orders succeeded and are committed."""
@@ -194,14 +205,14 @@ class Database:
                 self._connection.execute("ROLLBACK")
 
 
-def _answer(order: _Order) -> None:
+def _settle(answer: "Future[T]", result: T, error: BaseException | None) -> None:
     """Deliver result or error; a caller that hung up has cancelled its future, which is no reason to stop."""
-    if not order.answer.set_running_or_notify_cancel():
+    if not answer.set_running_or_notify_cancel():
         return
-    if order.error is not None:
-        order.answer.set_exception(order.error)
+    if error is not None:
+        answer.set_exception(error)
     else:
-        order.answer.set_result(order.result)
+        answer.set_result(result)
 
 
 def _refusal(error: sqlite3.Error) -> Exception:
