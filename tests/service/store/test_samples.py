@@ -134,5 +134,8 @@ def test_residuals_one_by_one_are_gathered_and_outlined(connection: sqlite3.Conn
     assert [s.seq[-1] for s in residuals.since_seq(connection, 1, 2, 5690)] and residuals.since_seq(
         connection, 1, 2, 5700
     ) == []
-    residuals.truncate(connection, 1, 1, 2, 5_100_000)
+    residuals.forget(connection, 1, 1, 2, 5_100_000, 5_600_000)
+    kept = residuals.select(connection, 1, 1, 2)
+    np.testing.assert_array_equal(kept.time_us, [*range(0, 5_101_000, 1000), *range(5_600_000, 5_700_000, 1000)])
+    residuals.forget(connection, 1, 1, 2, 5_100_000, 2**62)
     assert residuals.select(connection, 1, 1, 2).time_us.size == 5101
