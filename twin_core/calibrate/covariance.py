@@ -1,19 +1,22 @@
 """How certain the unknowns of a fit are, in the metric of the noise that the fit was made from."""
 
+from dataclasses import replace
+
 import numpy as np
 from numba import njit
 
 from twin_core._typing import FloatArray
-from twin_core.calibrate.optimise import Optimum
+from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
 from twin_core.calibrate.restricted import restricted_noise, told_directions
+from twin_core.parameters.vector import ParameterSet
 
 UNTOLD = 1e-13
 """Combinations of unknowns that readings and priors tell less than this share of the best are lost to rounding."""
 
-FARTHEST = 10.0
-"""No logarithm is followed further: a factor of twenty thousand."""
+LITTLE_COST = 0.5 * 1.645**2
+"""A likelihood interval of 90 % ends where the cost has risen by this."""
 
 
 def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
@@ -62,19 +65,28 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
     return np.asarray(least_squares.T @ spread @ least_squares)
 
 
-def upward_reach(problem: Problem, optimum: Optimum, position: int, std: float) -> float:
-    """Return how far up an unknown may move alone before the cost has risen by a half, at least ``std``.
+def is_open_ended(problem: Problem, optimum: Optimum, position: int) -> bool:
+    """Return whether an unknown may as well be larger than its fitted value by all that its prior allows.
 
-    A limit that the readings just touch has a slope on one side only: down the fit suffers, up nothing changes.
+    A limit that was never reached has a slope nowhere, and one that cuts off a peak by chance of the noise a slope on one
+    side only: down the fit suffers, up it hardly does once the others follow. They are refitted to find out.
+
+    Parameters
+    ----------
+    problem, optimum
+        The fit.
+    position
+        Of a free parameter that has a prior.
     """
-    reach, step = std, std
-    while 0.0 < step < FARTHEST:
-        moved = optimum.unknowns.copy()
-        moved[position] += step
-        if not problem.solve(moved, optimum.fit).cost < optimum.fit.cost + 0.5:
-            break
-        reach, step = step, 2.0 * step
-    return reach
+    mean, std = problem.prior()
+    here, parameters = float(optimum.unknowns[position]), problem.network.parameters
+    limit = parameters.parameters[parameters.free_index[position]]
+    held = replace(limit.at(limit.transform.to_value(here + float(std[position]))), frozen=True)
+    others = ParameterSet(tuple(held if p is limit else p for p in parameters.parameters))
+    network = problem.network.with_parameters(others)
+    refitted = minimise(problem.with_network(network), np.delete(optimum.unknowns, position))
+    own_cost = 0.5 * ((here - mean[position]) / std[position]) ** 2
+    return bool(refitted.fit.cost < optimum.fit.cost - own_cost + LITTLE_COST)
 
 
 @njit(cache=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
-from twin_core.calibrate.covariance import trajectory_covariance, upward_reach
+from twin_core.calibrate.covariance import is_open_ended, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
@@ -290,7 +290,8 @@ def _summary(
         stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         for name in (f"{e.label}.{q.name}" for e in effects for q in e.qualities() if q.open_ended):
             position = network.parameters.free_names.index(name)
-            stds[position] = upward_reach(problem, optimum, position, float(stds[position]))
+            if is_open_ended(problem, optimum, position):
+                stds[position] = network.parameters.prior_std[position]
         by_name = dict(zip(network.parameters.free_names, (stds * slopes).tolist(), strict=True))
         told = identified(network.parameters, stds)
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
