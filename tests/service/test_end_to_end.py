@@ -54,10 +54,10 @@ TRUTH = simulate()
 EPOCH_S = 1_772_323_200.0
 
 
-def send(client: TwinClient, rows: slice | list[int], twin: str = "pair") -> None:
+def send(client: TwinClient, rows: slice | list[int], twin: str = "pair", after_s: float = 0.0) -> None:
     index = np.arange(N_TIMES)[rows]
     values = {name: column[index].tolist() for name, column in TRUTH.items()}
-    client.ingest(twin, (EPOCH_S + index * STEP_S).tolist(), values)
+    client.ingest(twin, (EPOCH_S + after_s + index * STEP_S).tolist(), values)
 
 
 @pytest.fixture(scope="module")
@@ -135,6 +135,29 @@ def test_late_samples_end_in_the_same_state_as_samples_in_order(server: Server, 
         assert len(found.time) == 204
         ends[twin] = np.array([found.residual_K["T_a"][-3:], found.residual_K["T_b"][-3:]])
     np.testing.assert_allclose(ends["late"], ends["ordered"], atol=1e-6)
+
+
+def test_records_far_apart_end_the_same_in_any_order(server: Server) -> None:
+    client = server.client()
+    document = client.model("pair", 1).model
+    found = {}
+    first, second = [(slice(300, 360), 0.0), (slice(360, 400), 0.0)], [(slice(400, 450), 1e7), (slice(450, 500), 1e7)]
+    for twin, order in (("onward", first + second), ("backward", second + first)):
+        client.register({**SPEC, "twin": twin})
+        copy = {**document, "spec": {**document["spec"], "twin": twin}}
+        client._http.post(f"/v1/twins/{twin}/models", json=copy).raise_for_status()
+        client.activate(twin, 1)
+        for rows, after_s in order:
+            send(client, rows, twin, after_s)
+            found[twin] = client.residuals(twin)
+    onward, backward = found["onward"], found["backward"]
+    assert onward.time == backward.time and len(onward.time) == 200
+    for sensor in ("T_a", "T_b"):
+        np.testing.assert_allclose(
+            np.array(backward.residual_K[sensor]), np.array(onward.residual_K[sensor]), atol=1e-6
+        )
+    told = [[(a.sensor, a.start, a.stop) for a in client.anomalies(twin)] for twin in ("onward", "backward")]
+    assert told[0] == told[1]
 
 
 def test_restart_goes_on_from_the_checkpoint(server: Server) -> None:
