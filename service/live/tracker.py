@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from service.instants import format_instant
 from service.live import progress
+from service.live.caution import Caution, Rest
 from service.live.engine import Engine
 from service.live.position import RECENT, Position, is_far, next_count, stretch
 from service.live.progress import Step
@@ -31,37 +32,7 @@ log = logging.getLogger("service.live")
 PAUSE_S = 0.05
 """Shortest time between two steps, so that samples sent one by one are assimilated together."""
 RETRY_S = 2.0
-QUICK_S = 1.0
-"""A return to late samples that took longer is followed by a rest of the same length: a clock that stays wrong costs at
-most half of the time, and what came late meanwhile is taken in at once."""
 _EVER = -(2**62)
-
-
-@dataclass
-class _Caution:
-    """How the tracker gets past samples that cannot be assimilated.
-
-    A block that fails is tried again in halves, down to ``stride`` samples, which are skipped; each skip in a row
-    doubles the stride. A stretch of n such samples thus costs about 2 log2(n) attempts and at most n good samples.
-    """
-
-    most: int = progress.BLOCK
-    stride: int = 1
-    skipped: tuple[int, int] | None = None
-    """The last instant that is skipped, and the number at which the stream stood then."""
-
-    def failed(self, time_us: NDArray[np.int64], seq: int) -> bool:
-        """Hear that these samples failed; return whether they are skipped from now on."""
-        if time_us.size > self.stride:
-            self.most = max(int(time_us.size) // 2, self.stride)
-            return False
-        self.skipped = (int(time_us[-1]), seq)
-        self.most = self.stride = min(2 * self.stride, progress.BLOCK)
-        return True
-
-    def succeeded(self) -> None:
-        """Hear that a block was assimilated."""
-        self.most, self.stride, self.skipped = min(2 * self.most, progress.BLOCK), 1, None
 
 
 @dataclass(frozen=True)
@@ -93,14 +64,12 @@ class Tracker:
         self.catching_up = False
         self._database, self._hub, self._engine = database, hub, engine
         self._metrics, self._thresholds = metrics, thresholds
-        self._caution = _Caution()
+        self._caution = Caution()
         self._at: Position | None = None
         self._read: list[tuple[int, int, int]] = []
         """What was read of the archive, see ``look``."""
         self._detour: _Detour | None = None
-        self._left_s: float | None = None
-        """When the assimilation left the present for late samples; None if it is there."""
-        self._rests_until_s = 0.0
+        self._rest = Rest()
         self._told_seq, self._new_model = 0, True
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
@@ -170,8 +139,8 @@ class Tracker:
         if self.active is not None and self.active.version == active.version:
             return
         checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
-        self._caution, self.trouble, self.catching_up = _Caution(), None, True
-        self._detour, self.waits_us = None, None
+        self._caution, self.trouble, self.catching_up = Caution(), None, True
+        self._detour, self.waits_us, self._rest = None, None, Rest()
         self._stand(None if checkpoint is None else Position.of(checkpoint))
         self.active = active
 
@@ -190,8 +159,8 @@ class Tracker:
         reading = await self._database.read(
             progress.look, self.twin, read, self._told_seq, max(caution.most, 2), active.longest_gap_us, until_us
         )
-        if reading.late_us is not None and not self._rests():
-            self._caution = _Caution()
+        if reading.late_us is not None and not self._rest.lasts:
+            self._caution = Caution()
             if before is not None and reading.late_us <= before.time_us:
                 await self._go_back(active, before, reading.late_us, reading.until_us)
             return True
@@ -203,7 +172,9 @@ class Tracker:
             await self._return(active, detour, reading.seq)
             return True
         if count == 0:
-            self._arrive(reading.late_us is not None)
+            self._rest.begin()
+            if reading.late_us is not None:
+                self._rest.then(self._wake.set)
             self._told_seq, self.catching_up = reading.seq, False
             self._wait(int(time_us[0]) if time_us.size else None)
             return False
@@ -226,23 +197,9 @@ class Tracker:
         await self._keep(active, before, fresh, done, held, seq, reading.told)
         return True
 
-    def _rests(self) -> bool:
-        """Return whether late samples have to wait, because the last return to such took long."""
-        return self._left_s is None and asyncio.get_running_loop().time() < self._rests_until_s
-
-    def _arrive(self, late: bool) -> None:
-        """Note that the present is reached, and come back to late samples after a rest."""
-        loop = asyncio.get_running_loop()
-        if self._left_s is not None:
-            took_s = loop.time() - self._left_s
-            self._rests_until_s = loop.time() + took_s if took_s > QUICK_S else 0.0
-            self._left_s = None
-        if late:
-            loop.call_at(self._rests_until_s, self._wake.set)
-
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""
-        self._left_s = self._left_s or asyncio.get_running_loop().time()
+        self._rest.leave()
         if self._detour is not None:
             until_us = self._detour.until_us
         arguments = (self.twin, active.version, late_us, until_us)
@@ -258,7 +215,7 @@ class Tracker:
             arguments = (self.twin, active.version, done.time_us, detour.until_us)
             await self._hub.write(self.twin.key, progress.end_record, *arguments)
             back = replace(back, n_samples=back.n_samples + done.n_samples - detour.n_samples)
-        self._detour, self._caution = None, _Caution()
+        self._detour, self._caution = None, Caution()
         self._stand(back)
         last_us = detour.until_us - 1
         beyond = [(max(after, last_us), until, number) for after, until, number in detour.read if until > last_us]
