@@ -31,6 +31,9 @@ SWEEPS = 3
 UNTOLD = 1e-10
 """Combinations of unknowns that readings and priors tell less than this share of the best have no say."""
 
+ROUNDING = 1e-9
+"""Share of itself by which what each unknown is told may be wrong: it keeps a matrix of full rank one that is seen to be."""
+
 LEAST_LIKELY = 1e-3
 """Misfits of less than this probability are left out of the average."""
 
@@ -133,7 +136,8 @@ def restricted_log_likelihood(log_det: float, products: FloatArray) -> float:
     products : (n_unknowns + 1, n_unknowns + 1)
         [J, r]ᵀ Σ⁻¹ [J, r] with those of the priors; J must be of full rank.
     """
-    factor = np.linalg.cholesky(products[:-1, :-1])
+    hessian = products[:-1, :-1]
+    factor = np.linalg.cholesky(hessian + ROUNDING * np.diag(np.diag(hessian)))
     followed = solve_triangular(factor, products[:-1, -1], lower=True)
     left = max(float(products[-1, -1] - followed @ followed), 0.0)
     return float(-0.5 * (log_det + left) - np.log(np.diag(factor)).sum())

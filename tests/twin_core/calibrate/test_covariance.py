@@ -7,7 +7,7 @@ from tests.helpers import at_named, record_of
 from tests.twin_core.calibrate.test_calibrate import STEP_S, TRUTH, declared, exact_K, heat_W, scores
 from tests.twin_core.calibrate.test_outliers import spoilt
 from tests.twin_core.calibrate.test_restricted import dense, noise
-from twin_core.calibrate import calibrate, covariance
+from twin_core.calibrate import calibrate, covariance, restricted
 from twin_core.calibrate.covariance import gls_covariance, trajectory_covariance
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.residual_noise import fit_whitener, sensor_jacobians
@@ -138,3 +138,21 @@ def test_what_only_the_guesses_tell_keeps_their_uncertainty() -> None:
     np.testing.assert_allclose(model.covariance, model.covariance.T, rtol=1e-9, atol=1e-12)
     assert smallest > 0.0
     assert together @ model.covariance @ together == pytest.approx(1.0, rel=0.02)
+
+
+def test_long_records_are_averaged_within_their_segments(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two segments of 300 readings, one of them with a hole: six together, and none across the gap between them."""
+    records = [telemetry(0, 0.05), telemetry(1, 0.05)]
+    records[1].values["T_b"][100:150] = np.nan
+    done = fit_trajectories(load_spec(declared()), records)
+    whole = trajectory_covariance(done.problem, done.optimum, done.whitener)
+    monkeypatch.setattr(restricted, "MOST_ROWS", 100)
+    residuals = done.problem.residuals(done.optimum.fit)
+    left = restricted._leftovers(done.problem, done.optimum, done.whitener, residuals)
+    for sensor, together, expected in ((0, 6, [50, 50]), (1, 6, [50, 41])):
+        assert left[sensor].together == together
+        parts = [r[:, sensor][np.isfinite(r[:, sensor])] for r in residuals]
+        means = [p[: n * together].reshape(n, together).mean(axis=1) for p, n in zip(parts, expected, strict=True)]
+        np.testing.assert_allclose(left[sensor].columns[:, -1], np.concatenate(means), atol=1e-12)
+    averaged = trajectory_covariance(done.problem, done.optimum, done.whitener)
+    np.testing.assert_allclose(np.sqrt(np.diag(averaged)), np.sqrt(np.diag(whole)), rtol=0.3)

@@ -153,3 +153,14 @@ def test_averaged_readings_tell_the_same_misfit() -> None:
     fewer = [Leftover(p.time_s[rows].mean(axis=1), p.columns[rows].mean(axis=1), 3) for p in left]
     once, again = (expected_noise(parts, no_prior(33), models, SPAN_S) for parts in (left, fewer))
     assert np.sum([power_K2_s(m) for m in again]) == pytest.approx(np.sum([power_K2_s(m) for m in once]), rel=0.15)
+
+
+@pytest.mark.parametrize("smallness", [1e-3, 1e-8])
+def test_a_misfit_out_of_all_proportion_to_the_noise_is_weighed(smallness: float) -> None:
+    """A residual that is all colour, white noise next to none: the numbers stay finite and the misfit about what it is."""
+    rng = np.random.default_rng(5)
+    left, _ = fitted(rng, noise(1.0, 2e4, 1e-3))
+    models = [noise(1.0, 2e4, smallness)] * len(left)
+    for found in expected_noise(left, no_prior(33), models, SPAN_S):
+        assert np.isfinite(found.white_K2)
+        assert 0.1 < power_K2_s(found) / power_K2_s(noise(1.0, 2e4)) < 10.0
