@@ -1,7 +1,7 @@
 """The closed loop over the suite: is the right effect named, is it listed, and is a healthy spacecraft left alone?
 
-``python -m benchmarks.loop [--groups ...] [--networks N] [--clean N] [--effects NAME ...] [--processes 2] [--results FILE]`` runs
-the cases, appends one line of JSON per case to FILE (cases already in it are not run again), and saves
+``python -m benchmarks.loop [--groups ...] [--networks N] [--clean N] [--effects NAME ...] [--first-seed N] [--processes 2]
+[--results FILE]`` runs the cases, appends one line of JSON per case to FILE (cases already in it are not run again), and saves
 ``benchmarks/tables/loop.md``.
 """
 
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bands import Row
-from benchmarks.loop_cases import GROUPS, N_CLEAN, N_NETWORKS, Task, suite
+from benchmarks.loop_cases import FIRST_SEED, GROUPS, N_CLEAN, N_NETWORKS, Task, suite
 from benchmarks.loop_table import save_tables
 from benchmarks.network_cases import Case
 from twin_core.calibrate.second_order import fit_network, to_model
@@ -158,14 +158,19 @@ def main() -> None:
     parser.add_argument("--networks", type=int, default=N_NETWORKS, help="networks per effect")
     parser.add_argument("--clean", type=int, default=N_CLEAN, help="clean records")
     parser.add_argument("--effects", nargs="+", help="only these effects")
+    parser.add_argument(
+        "--first-seed", type=int, default=FIRST_SEED, help="another one draws other cases: loop_SEED.md"
+    )
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--results", type=Path, default=RESULTS)
     arguments = parser.parse_args()
-    tasks = suite(arguments.groups, n_networks=arguments.networks, n_clean=arguments.clean)
+    own = arguments.first_seed == FIRST_SEED
+    size = {"n_networks": arguments.networks, "n_clean": arguments.clean}
+    tasks = suite(arguments.groups, **size, first_seed=arguments.first_seed)
     tasks = [task for task in tasks if not arguments.effects or task.effect in arguments.effects]
     rows = run_all(tasks, arguments.results, arguments.processes, run, line)
     if not arguments.effects:
-        save_tables(rows)
+        save_tables(rows, "loop" if own else f"loop_{arguments.first_seed}")
 
 
 if __name__ == "__main__":

@@ -58,16 +58,22 @@ class Task:
         return next(case for case in drawn if case.trace > LEAST_TRACE)
 
 
-def suite(groups: Sequence[str] = GROUPS, *, n_networks: int = N_NETWORKS, n_clean: int = N_CLEAN) -> list[Task]:
-    """Return the tasks of the suite's groups: so many networks per effect, and so many clean records."""
+def suite(
+    groups: Sequence[str] = GROUPS,
+    *,
+    n_networks: int = N_NETWORKS,
+    n_clean: int = N_CLEAN,
+    first_seed: int = FIRST_SEED,
+) -> list[Task]:
+    """Return the tasks of the suite's groups: so many networks per effect, so many clean records, seeds from where."""
     every = {
         "network": [
-            Task("network", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(n_networks)
+            Task("network", e, first_seed + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(n_networks)
         ],
-        "fem": [Task("fem", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(FEM_EFFECTS) for k in range(N_FEM)],
-        "clean": [Task("clean", None, FIRST_SEED + k) for k in range(n_clean)],
+        "fem": [Task("fem", e, first_seed + 10 * i + k) for i, e in enumerate(FEM_EFFECTS) for k in range(N_FEM)],
+        "clean": [Task("clean", None, first_seed + k) for k in range(n_clean)],
         "outside": [
-            Task("outside", e, FIRST_SEED + 10 * i + k) for i, e in enumerate(OUTSIDE) for k in range(N_OUTSIDE)
+            Task("outside", e, first_seed + 10 * i + k) for i, e in enumerate(OUTSIDE) for k in range(N_OUTSIDE)
         ],
     }
     return [task for group in groups for task in every[group]]

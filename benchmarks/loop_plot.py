@@ -12,8 +12,8 @@ from benchmarks.markdown import TABLES
 COLOURS = {"network": "tab:blue", "fem": "tab:orange", "clean": "tab:green", "outside": "tab:red"}
 
 
-def save_plot(rows: Sequence[Row]) -> str:
-    """Save ``benchmarks/tables/loop.svg`` from the rows of a run; return its place in a table's text."""
+def save_plot(rows: Sequence[Row], name: str) -> str:
+    """Save ``benchmarks/tables/NAME.svg`` from the rows of a run; return its place in a table's text."""
     figure = Figure((11.0, 3.8), layout="constrained")
     errors, spread, seconds = figure.subplots(1, 3)
     for group, colour in COLOURS.items():
@@ -36,5 +36,5 @@ def save_plot(rows: Sequence[Row]) -> str:
         spread.axvline(edge, color="k", linestyle=":", linewidth=0.8)
     spread.set(xlabel="(estimate - truth) / standard deviation", ylabel="density", yticks=[])
     errors.legend()
-    figure.savefig(TABLES / "loop.svg", metadata={"Date": None})
-    return "![Errors, parameters about the truth, seconds](loop.svg)"
+    figure.savefig(TABLES / f"{name}.svg", metadata={"Date": None})
+    return f"![Errors, parameters about the truth, seconds]({name}.svg)"

@@ -9,21 +9,21 @@ from benchmarks.loop_plot import save_plot
 from benchmarks.markdown import markdown_table, save_table
 
 
-def save_tables(rows: Sequence[Row]) -> None:
-    """Save ``benchmarks/tables/loop.md`` and its plot from the rows of a run."""
+def save_tables(rows: Sequence[Row], name: str = "loop") -> None:
+    """Save ``benchmarks/tables/NAME.md`` and its plot from the rows of a run."""
     failed = [row for row in rows if "error" in row]
     good = [row for row in rows if "error" not in row]
     parts = [
         "## Targets",
         targets(good),
-        save_plot(good),
+        save_plot(good, name),
         "## By effect",
         by_effect(good),
         "## Worst cases",
         worst(good),
     ]
     note = "".join(f"\nFailed: {row['task']}: {row['error']}" for row in failed)
-    save_table("loop", "Closed loop over seeded spacecraft", "\n\n".join(parts), "benchmarks.loop", note)
+    save_table(name, "Closed loop over seeded spacecraft", "\n\n".join(parts), "benchmarks.loop", note)
 
 
 def _share(rows: Sequence[Row], test: Callable[[Row], bool]) -> str:
