@@ -268,6 +268,27 @@ def sensor_drift(world: World, node: int) -> Hidden:
     return _misread(world, node, rate * world.time_s, {"d_K_per_s": rate})
 
 
+def sensor_lag(world: World, node: int) -> Hidden:
+    """Return a sensor that follows its node with a delay of some minutes."""
+    tau_s = float(np.exp(world.rng.uniform(np.log(120.0), np.log(900.0))))
+
+    def rates(x: np.ndarray) -> np.ndarray:
+        return np.array([(x[node] - x[world.n]) / tau_s])
+
+    return Hidden({"sensor": f"T{node}"}, rates=rates, n_extra=1, reads={node: world.n}, parameters={"tau_s": tau_s})
+
+
+def input_power_law(world: World, node: int) -> Hidden:
+    """Return a payload that delivers what it declares at one value, anywhere about its range, and another power elsewhere."""
+    channel = int(world.rng.choice(list(world.power)))
+    declared = world.power[channel]
+    n = float(world.rng.choice([world.rng.uniform(0.5, 0.75), world.rng.uniform(1.4, 2.0)]))
+    reference = float(declared.max() * np.exp(world.rng.uniform(np.log(0.2), np.log(1.2))))
+    more = np.where(declared > 0.0, reference * (declared / reference) ** n - declared, 0.0)
+    heat = _into(world, channel, lambda t, k, x: more[k])
+    return Hidden({"channel": f"P{channel}"}, heat, parameters={"n": n, "reference": reference})
+
+
 HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
     make.__name__: make
     for make in (
@@ -292,5 +313,7 @@ HIDDEN: dict[str, Callable[[World, int], Hidden]] = {
         emissivity_step,
         sensor_bias,
         sensor_drift,
+        sensor_lag,
+        input_power_law,
     )
 }

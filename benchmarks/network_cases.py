@@ -42,8 +42,11 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
     begun = rng.bit_generator.state
     healthy = world.simulate()[:, : world.n]
     rng.bit_generator.state = begun
-    truth = world.simulate(hidden)[:, : world.n]
-    read = truth if hidden.offset_K is None else truth + hidden.offset_K
+    states = world.simulate(hidden)
+    truth = states[:, : world.n]
+    read = truth.copy() if hidden.offset_K is None else truth + hidden.offset_K
+    for at, state in hidden.reads.items():
+        read[:, at] = states[:, state]
     noise = float(rng.uniform(0.05, 0.15))
     unsensed = int(rng.integers(0, world.n)) if rng.random() < 0.3 else None
     if hidden.where.get("sensor") == f"T{unsensed}":

@@ -34,6 +34,8 @@ class Hidden:
         A relay: ``crossing(states)`` falls through zero where ``flip()`` is due.
     offset_K : (n_times, n_nodes)
         What the sensors read beyond the truth.
+    reads : node -> state
+        Which state its sensor reads instead of it.
     onset_s
         When it sets in; None where it is there from the start.
     parameters
@@ -47,6 +49,7 @@ class Hidden:
     n_extra: int = 0
     switch: "Switch | None" = None
     offset_K: np.ndarray | None = None
+    reads: dict[int, int] = field(default_factory=dict)
     onset_s: float | None = None
     parameters: dict[str, Any] = field(default_factory=dict)
 

@@ -7,12 +7,21 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
-from twin_core.effects.inputs import correct_channel, driving_channels
+from twin_core.effects.inputs import correct_channel, driving_channels, gain_is_known
 from twin_core.network.model import Addition, Layout
+
+N_REFERENCES = 3
+"""References that are tried, from the least positive value of a channel to the largest."""
+
+LEAST_LEVELS = 2
+"""One level above zero delivers what a gain does."""
 
 
 class InputPowerLaw(Effect):
-    """delivered = declared * (declared / reference)^(n - 1)."""
+    """delivered = declared * (declared / reference)^(n - 1).
+
+    Where the loads' gain is unknown it takes the place of the reference, which is then a setting.
+    """
 
     name = "input_power_law"
     keys = ("channel",)
@@ -22,18 +31,25 @@ class InputPowerLaw(Effect):
     reported_settings = ("reference",)
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return the exponent; one is null."""
-        return (Quality("n", "", null=1.0, positive=True, prior_std=1.0),)
+        """Return the exponent, one is null, and the value at which what is delivered is what is declared."""
+        exponent = Quality("n", "", null=1.0, positive=True, prior_std=1.0)
+        return (
+            (exponent,)
+            if "reference" in self.settings
+            else (exponent, Quality("reference", "", positive=True, prior_std=1.0))
+        )
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""
-        reference = float(self.settings["reference"])
+        held = self.settings.get("reference")
 
         def shape(declared: FloatArray, time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+            exponent, reference = values[0], float(held) if held is not None else values[1]
             ratio = np.maximum(declared, 0.0) / reference
             logarithm = np.log(np.maximum(ratio, 1e-12))
-            delivered = np.where(ratio > 0.0, declared * np.exp((values[0] - 1.0) * logarithm), 0.0)
-            return delivered - np.maximum(declared, 0.0), [delivered * logarithm]
+            delivered = np.where(ratio > 0.0, declared * np.exp((exponent - 1.0) * logarithm), 0.0)
+            slopes = [delivered * logarithm, -(exponent - 1.0) / reference * delivered]
+            return delivered - np.maximum(declared, 0.0), slopes[: values.size]
 
         return correct_channel(self, layout, shape)
 
@@ -44,8 +60,13 @@ class InputPowerLaw(Effect):
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
-        """Yield the null effect around the median of the channel's positive values, if it takes several."""
+        """Yield the null effect around several values of the channel, if it takes several above zero."""
         series = survey.along.inputs.get(where["channel"], np.zeros(0))
         positive = series[series > 0.0]
-        if positive.size and np.unique(np.round(positive / positive.max(), 3)).size >= 3:
+        if not positive.size or np.unique(np.round(positive / positive.max(), 3)).size < LEAST_LEVELS:
+            return
+        if not gain_is_known(survey.layout, where["channel"]):
             yield cls(where, {"n": 1.0}, {"reference": float(np.median(positive))})
+            return
+        for reference in np.geomspace(positive.min(), positive.max(), N_REFERENCES):
+            yield cls(where, {"n": 1.0, "reference": float(reference)})

@@ -136,6 +136,12 @@ def test_input_power_law() -> None:
     np.testing.assert_allclose(found, np.outer(delivered - [0.0, 25.0, 100.0], [0.6, 0.0, 0.4]), atol=1e-9)
 
 
+def test_an_input_power_law_whose_reference_is_to_be_found() -> None:
+    found = heat_W(REGISTRY["input_power_law"]({"channel": "Q_a"}, {"n": 2.0, "reference": 80.0}))
+    delivered = np.array([0.0, 25.0, 100.0]) ** 2 / 80.0
+    np.testing.assert_allclose(found, np.outer(delivered - [0.0, 25.0, 100.0], [0.6, 0.0, 0.4]), atol=1e-9)
+
+
 def test_input_power_law_of_a_percentage_keeps_its_gain() -> None:
     found = heat_W(REGISTRY["input_power_law"]({"channel": "H"}, {"n": 2.0}, {"reference": 100.0}))
     np.testing.assert_allclose(found[:, 2], 0.4 * (np.array([25.0, 0.0, 1.0]) - [50.0, 0.0, 10.0]), atol=1e-9)
@@ -229,13 +235,16 @@ def test_a_power_law_needs_several_levels() -> None:
     for series, n_starts in (
         (np.full(20, 30.0), 0),
         (np.where(np.arange(20) % 2, 30.0, 0.0), 0),
-        (along.inputs["Q_a"], 1),
+        (np.where(np.arange(20) % 2, 30.0, 5.0), 3),
+        (along.inputs["Q_a"], 3),
     ):
         inputs = {**along.inputs, "Q_a": series}
         survey = survey_of(
             network, Along(along.time_s, along.temperatures_K, along.boundaries_K, inputs, along.sun_factor)
         )
         assert len(list(REGISTRY["input_power_law"].starts({"channel": "Q_a"}, survey))) == n_starts
+        in_percent = list(REGISTRY["input_power_law"].starts({"channel": "H"}, survey))
+        assert [list(effect.values) for effect in in_percent] == [["n"]], "an unknown gain stands for the reference"
 
 
 def test_a_table_rests_on_the_levels_of_its_channel() -> None:
