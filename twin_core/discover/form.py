@@ -10,7 +10,10 @@ from twin_core.discover.shortlist import LATENT_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.parameters.transforms import Log
 
-N_REFITS = 6
+N_REFITS, N_RIVALS = 6, 2
+OUTDONE_NATS = 15.0
+"""A free form contains the smooth laws, so beside a true one it is about as likely: only one far likelier tells of another."""
+
 FAR_STD = 3.0
 """A declared guess counts as left behind beyond so many standard deviations of its prior: a factor of twenty."""
 
@@ -50,6 +53,31 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
     needed
         Log Bayes factor from which the free form counts as supported.
     """
+    best, n_tried = _free_forms(trial, effects, needed)
+    tops = (try_effects(trial, (*trial.effects, effect), n_passes=10) for effect in best[:N_REFITS])
+    return any(weigh(trial, top, n_tried).log_bayes_factor > needed for top in tops)
+
+
+def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float) -> bool:
+    """Return whether a free form of temperature in the place of named effects is far likelier than they are.
+
+    Where the heat visits one flank of a curve, another law with a kink or two comes near all of it: what is left then is
+    small beside the heat, but the free form needs none of it.
+
+    Parameters
+    ----------
+    simple
+        Without the effects.
+    trial, effects, needed
+        As in :func:`leaves_a_repeatable_heat`.
+    """
+    best, _ = _free_forms(simple, effects, needed)
+    instead = (try_effects(simple, (*simple.effects, effect), n_passes=10) for effect in best[:N_RIVALS])
+    return any(weigh(rival, trial, 1).log_bayes_factor < -OUTDONE_NATS for rival in instead)
+
+
+def _free_forms(trial: Trial, effects: Sequence[Effect], needed: float) -> tuple[list[Effect], int]:
+    """Return the free forms on top of a trial at the nodes where effects act, the best first, and how many places."""
     layout = trial.fit.network.layout
     nodes = {node for effect in effects for node in touched_nodes(effect, layout)}
     n_tried, best = 1, dict[object, tuple[float, Effect]]()
@@ -60,6 +88,4 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
             worth, form = schwarz_gain(probe, trial.n_samples), (probe.effect.place, len(probe.effect.amplitudes))
             if probe.gain > needed and worth > best.get(form, (-np.inf, probe.effect))[0]:
                 best[form] = worth, probe.effect
-    free = [effect for _, effect in sorted(best.values(), key=lambda item: -item[0])[:N_REFITS]]
-    tops = (try_effects(trial, (*trial.effects, effect), n_passes=10) for effect in free)
-    return any(weigh(trial, top, n_tried).log_bayes_factor > needed for top in tops)
+    return [effect for _, effect in sorted(best.values(), key=lambda item: -item[0])], n_tried

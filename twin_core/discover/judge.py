@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
-from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
+from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration, outdone_by_a_free_form
 from twin_core.effects.base import Effect
 
 N_VALIDATED, N_VALIDATED_FREE = 3, 8
@@ -110,7 +110,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         validation = validate(state.trial, best.trial)
         own = replace(best, validation=validation)
         if is_valid(validation, own.effects) and is_told(own) and not leaves_declaration(state.trial, own.trial):
-            if _merely_resembles(own, needed):
+            if _merely_resembles(state.trial, own, needed):
                 state.rejected.append(own)  # what explains less is no better a name for this heat
                 break
             elsewhere = [j for j in judged if _places(j) != _places(best) and j not in failed]
@@ -124,10 +124,13 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def _merely_resembles(judged: Judged, needed: float) -> bool:
+def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
     """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
     named = [effect for effect in judged.effects if not effect.fallback]
-    return bool(named) and leaves_a_repeatable_heat(judged.trial, named, needed)
+    return bool(named) and (
+        leaves_a_repeatable_heat(judged.trial, named, needed)
+        or outdone_by_a_free_form(simple, judged.trial, named, needed)
+    )
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

@@ -8,13 +8,15 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
-from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration
+from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration, outdone_by_a_free_form
 from twin_core.discover.judge import Finding, Judged, Search, threshold
 from twin_core.discover.screen import screen, survey_of
 from twin_core.discover.search import prune
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.input_gain import InputGain
+from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.proportional_heater import ProportionalHeater
+from twin_core.effects.radiation_to_sink import RadiationToSink
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
@@ -80,6 +82,23 @@ def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[
     base, trial = named(heat_W)
     assert weigh(base, trial, 1).log_bayes_factor > NEEDED  # either way the heater looks well supported
     assert leaves_a_repeatable_heat(trial, trial.effects, NEEDED) is left
+    assert outdone_by_a_free_form(base, trial, trial.effects, NEEDED) is left
+
+
+@pytest.mark.parametrize("law", ["radiation", "leak", "constant"])
+def test_a_smooth_law_is_not_outdone_by_the_free_form_that_contains_it(law: str) -> None:
+    """A polynomial of temperature holds a leak and a load exactly, radiation nearly: then the name stands."""
+    heat = {
+        "radiation": (lambda x: -0.06 * 5.670374419e-8 * (x**4 - WALL_K**4), RadiationToSink, "sink", "R_m2"),
+        "leak": (lambda x: 0.4 * (WALL_K - x), LeakToBoundary, "boundary", "G_W_per_K"),
+        "constant": (lambda x: 5.0, ConstantHeatLoad, None, "Q_W"),
+    }[law]
+    hidden, kind, key, size = heat
+    base = declared(SPEC, record_of(hidden))
+    effect = kind({"node": "a"} | ({key: "wall"} if key else {}), {size: 0.05})
+    trial = try_effects(base, [effect], n_passes=15)
+    assert weigh(base, trial, 1).log_bayes_factor > NEEDED
+    assert not outdone_by_a_free_form(base, trial, trial.effects, NEEDED)
 
 
 def test_an_effect_that_rescales_its_node_leaves_the_declaration() -> None:
