@@ -137,5 +137,10 @@ def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
         parts = [r.values[name][np.isfinite(r.values[name])] for r in records if name in r.values]
         samples = np.concatenate(parts) if parts else np.zeros(0)
         if samples.size and np.ptp(samples) == 0.0:
-            said.append(f"channel '{name}' never changes: what rests tells nothing of capacities")
+            stuck = (
+                "; if the sensor is stuck, take it out: what is found around it is wrong"
+                if name in spec.sensors
+                else ""
+            )
+            said.append(f"channel '{name}' never changes: what rests tells nothing of capacities{stuck}")
     return said
