@@ -1,6 +1,7 @@
 """Copy the saved tables into the README, between their markers: its numbers are those that were printed."""
 
 import re
+from itertools import dropwhile, takewhile
 from pathlib import Path
 
 from benchmarks.markdown import TABLES
@@ -11,7 +12,8 @@ README = TABLES.parents[1] / "README.md"
 def table_of(name: str) -> str:
     """Return the first table of a saved page."""
     lines = (TABLES / f"{name}.md").read_text().splitlines()
-    return "\n".join(line for line in lines if line.startswith("|"))
+    from_first = dropwhile(lambda line: not line.startswith("|"), lines)
+    return "\n".join(takewhile(lambda line: line.startswith("|"), from_first))
 
 
 def refresh(readme: Path = README) -> None:
