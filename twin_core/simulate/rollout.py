@@ -3,7 +3,7 @@
 Steps are taken in the nodes' enthalpies: a capacity that changes within a step takes up all of its heat, and the implicit
 equations have one solution where the heats fall as the temperatures rise. Those of a whole stretch of steps are solved
 together by Newton's method: the heat balance is evaluated once for all points (vectorised), the linear recursion runs
-compiled. Of a stretch that does not converge the leading steps that do are kept, and it is cut, down to one step.
+compiled. A stretch that does not converge is cut, down to one step; behind a sharp capacity the leading steps that do are kept.
 """
 
 from dataclasses import dataclass
@@ -99,7 +99,7 @@ def _newton(
     last: int,
     guess: FloatArray,
 ) -> FloatArray:
-    """Solve steps first..last-1 together for the enthalpies; return the stage states of the leading steps that settle.
+    """Solve steps first..last-1 together for the enthalpies; return the stage states of leading steps that have settled.
 
     A step settles once those before it have: where the method takes long for all, it has not been in vain for the first.
     """
@@ -134,7 +134,8 @@ def _newton(
         if change * contraction < TOLERANCE_K:
             settled = n_steps
             break
-        settled = int(np.argmax(changes >= TOLERANCE_K))
+        # A sharp capacity holds the method up step by step. What else does is a relay's switching, no place to cut at.
+        settled = int(np.argmax(changes >= TOLERANCE_K)) if network.capacities else 0
         # A step across a kink may swing from one side to the other: half the way ends that.
         stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved
         stages = stages if inside else np.clip(stages, lowest, highest)
