@@ -164,6 +164,25 @@ def look(
     return Reading(seq, first, known_us, fresh, told)
 
 
+def outdates_inputs(
+    connection: sqlite3.Connection, twin: Entry, read: Sequence[tuple[int, int, int]], until_us: int
+) -> bool:
+    """Return whether what lies from ``until_us`` on was read with inputs that hold there wrongly, see ``look``.
+
+    The state starts anew behind a long gap, but an input holds until its next sample: one that came late, too.
+    """
+    before = [(after, min(until, until_us - 1), number) for after, until, number in read if after < until_us]
+    late = [samples.arrived(connection, twin.key, number, after + 1, until + 1) for after, until, number in before]
+    late_us = np.concatenate([*late, _NONE])
+    inputs = [row for row, name in enumerate(twin.channels) if name not in twin.sensors]
+    if not (late_us.size and inputs):
+        return False
+    found = samples.select(connection, twin.key, len(twin.channels), inputs, int(late_us.min()), until_us + 1)
+    held = np.isfinite(found.values)
+    last = found.time_us[held.shape[1] - 1 - held[:, ::-1].argmax(axis=1)]
+    return bool(np.isin(last[held.any(axis=1)], late_us).any())
+
+
 def _first_in_company(
     connection: sqlite3.Connection, twin: int, instants: NDArray[np.int64], longest_gap_us: float
 ) -> int | None:

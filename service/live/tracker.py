@@ -37,7 +37,8 @@ _EVER = -(2**62)
 
 @dataclass(frozen=True)
 class _Detour:
-    """A return to late samples that ends where a long gap does: behind it the state starts anew, so all there stays true.
+    """A return to late samples that ends where a long gap does: behind it the state starts anew, so all there stays true,
+    unless an input that came late holds there.
 
     ``back`` is where the assimilation goes on afterwards, with what was read until then; ``n_samples`` is how many
     there had been where the detour began.
@@ -209,8 +210,16 @@ class Tracker:
         self._stand(None if checkpoint is None else Position.of(checkpoint))
 
     async def _return(self, active: Active, detour: _Detour, seq: int) -> None:
-        """End a detour: the archive before its end was read when the stream stood at ``seq``."""
+        """End a detour: the archive before its end was read when the stream stood at ``seq``.
+
+        Where an input that came late holds on behind it, the assimilation goes on from here instead.
+        """
         done, back = self._at, detour.back
+        if await self._database.read(progress.outdates_inputs, self.twin, detour.read, detour.until_us):
+            checkpoint = await self._database.write(progress.rewind, self.twin, active.version, detour.until_us, None)
+            self._detour, self._caution = None, Caution()
+            self._stand(None if checkpoint is None else Position.of(checkpoint))
+            return
         if done is not None:
             arguments = (self.twin, active.version, done.time_us, detour.until_us)
             await self._hub.write(self.twin.key, progress.end_record, *arguments)

@@ -4,6 +4,7 @@ import json
 import os
 import sqlite3
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -306,6 +307,35 @@ def test_late_samples_of_two_records_end_each_in_its_own(client: AppClient) -> N
         assert found[f"{start}T00:00:50.500000Z"] == SCALE_K * (50.5**2 - 50**2)
         assert found[f"{start}T00:00:51Z"] == SCALE_K * (51**2 - 50.5**2)
         assert found[f"{start}T00:01:39Z"] == before[f"{start}T00:01:39Z"]
+
+
+class Powered(FakeWorkbench):
+    """Gives the power that holds for the NIS."""
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        power = telemetry.values["Q_px"]
+        last = np.maximum.accumulate(np.where(np.isfinite(power), np.arange(power.size), 0))
+        return replace(super().assimilate(document, telemetry, state), nis=power[last])
+
+
+@pytest.mark.parametrize(
+    ("late_W", "opening_W", "expected_W"), [(5.0, None, 5.0), (5.0, 2.0, 2.0), (None, None, 0.5), (0.5, None, 0.5)]
+)
+def test_an_input_that_came_late_holds_over_a_long_gap(
+    make_client, late_W: float | None, opening_W: float | None, expected_W: float
+) -> None:
+    client = make_client(workbench=Powered)
+    client.post("/v1/twins", json=SPEC)
+    squares(client)
+    send(client, [LATER + k for k in range(10)], [290.0] * 10, Q_px=[opening_W] + [None] * 9)
+    residuals(client)
+    send(client, [99.5], [290.0], Q_px=[late_W])
+    residuals(client)
+    found = client.get(f"{TWIN}/residuals").json()
+    assert found["nis"] == [0.5] * 100 + [late_W or 0.5] + [expected_W] * 10
+    send(client, [LATER + 10], [290.0], Q_px=[None])
+    residuals(client)
+    assert client.get(f"{TWIN}/residuals", params={"start": LATER}).json()["nis"] == [expected_W] * 11
 
 
 class Slow(FakeWorkbench):
