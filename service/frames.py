@@ -35,6 +35,9 @@ class Batch:
     values: NDArray[np.float64]
 
 
+MOST_VALUES = 2**24
+"""Of one batch, missing ones included: a short body may stand for very many of them. 16 MiB of numbers are always fewer."""
+
 Units = Mapping[str, str | None]
 """Channel -> unit, in the order of the rows."""
 TOLD_BY_THE_ARCHIVE = frozenset({"time", "values", "units", "samples", "downsampled"})
@@ -47,7 +50,7 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
     Raises
     ------
     Problem
-        400 if the body is not JSON, 422 naming the field otherwise.
+        400 if the body is not JSON, 413 if it holds too many samples, 422 naming the field otherwise.
     """
     document = _load(body, "body")
     times, columns = _members(document, "", TOLD_BY_THE_ARCHIVE)
@@ -58,6 +61,7 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
     texts = len(document) + len(columns) + len(units) + sum(unit is not None for unit in units.values())
     _refuse_repeated(body, texts + [*map(type, times)].count(str), "")
     n_times, names = len(times), list(channels)
+    _refuse_vast(n_times, channels)
     for name, column in columns.items():
         if name not in channels or type(column) is not list or len(column) != n_times:
             _refuse_column(name, column, n_times, channels)
@@ -69,6 +73,13 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
         else:
             values[[names.index(name) for name in columns]] = matrix
     return Batch(parse_instants(times), values)
+
+
+def _refuse_vast(n_times: int, channels: Units) -> None:
+    """Refuse more samples than memory and store have room for (413)."""
+    if n_times * len(channels) > MOST_VALUES:
+        most = MOST_VALUES // len(channels)
+        raise Problem(413, f"the body holds {n_times} samples, at most {most} fit; send smaller batches")
 
 
 def _refuse_column(name: str, column: Any, n_times: int, channels: Units) -> NoReturn:
@@ -115,9 +126,10 @@ def parse_frames(body: bytes, channels: Units) -> Batch:
     Raises
     ------
     Problem
-        400 naming the line that is not JSON, 422 naming line and field otherwise.
+        400 naming the line that is not JSON, 413 if there are too many, 422 naming line and field otherwise.
     """
     lines = [(number, line) for number, line in enumerate(body.split(b"\n"), start=1) if line.strip()]
+    _refuse_vast(len(lines), channels)
     frames = [_members(_load(line, f"line {number}"), f"line {number}: ") for number, line in lines]
     n_texts = [2 + len(sample) + (type(time) is str) for time, sample in frames]
     if body.count(b'"') != 2 * sum(n_texts):

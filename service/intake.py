@@ -8,11 +8,12 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
 
-from service.frames import Batch
+from service.frames import MOST_VALUES, Batch
 from service.live.live import Live
 from service.messages import SampleStretch
 from service.metrics import Metrics
@@ -53,7 +54,10 @@ class Intake:
 
     def _begin(self, twin: Entry) -> None:
         """Hand what waits to the writer as one batch."""
-        tickets, self._lines[twin.key] = self._lines[twin.key], []
+        line = self._lines[twin.key]
+        n_values = accumulate(ticket.batch.values.size for ticket in line)
+        n_first = max(1, sum(n <= MOST_VALUES for n in n_values))
+        tickets, self._lines[twin.key] = line[:n_first], line[n_first:]
         if tickets:
             batch = _joined([ticket.batch for ticket in tickets])
             self._hub.submit_then(partial(self._done, twin, tickets), twin.key, _append, twin, batch)

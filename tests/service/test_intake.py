@@ -3,7 +3,10 @@
 import asyncio
 
 import httpx
+import orjson
+import pytest
 
+from service import frames, intake
 from service.store.database import Database
 from tests.service.harness import AppClient
 
@@ -53,3 +56,29 @@ def test_a_refused_request_harms_no_other(registered: AppClient) -> None:
     statuses = [answer.status_code for answer in registered.portal.call(send)]
     assert statuses == [200, 422] * 20
     assert registered.get(ROUTE).json()["samples"] == 20
+
+
+@pytest.mark.parametrize("form", ["json", "x-ndjson"])
+def test_a_short_body_of_very_many_missing_values_is_refused(registered: AppClient, monkeypatch, form: str) -> None:
+    monkeypatch.setattr(frames, "MOST_VALUES", 30)
+    for n_times, status in ((10, 200), (11, 413)):
+        columns = orjson.dumps({"time": [*range(n_times)], "values": {}})
+        lines = b"\n".join(orjson.dumps({"time": k, "values": {}}) for k in range(n_times))
+        body = columns if form == "json" else lines
+        answer = registered.post(ROUTE, content=body, headers={"Content-Type": f"application/{form}"})
+        assert answer.status_code == status, answer.text
+    assert "at most 10 fit" in answer.json()["detail"]
+    assert registered.get(ROUTE).json()["samples"] == 10
+
+
+def test_only_so_much_shares_a_commit(registered: AppClient, monkeypatch) -> None:
+    sizes = []
+    append = intake._append
+    monkeypatch.setattr(intake, "_append", lambda c, t, batch: sizes.append(batch.values.size) or append(c, t, batch))
+    monkeypatch.setattr(intake, "MOST_VALUES", 30)
+    bodies = [
+        {"time": [100 * k + j for j in range(n)], "values": {"T_px": [290] * n}} for k, n in enumerate([4] * 9 + [20])
+    ]
+    reports = at_once(registered, bodies)
+    assert [report["accepted"] for report in reports] == [4] * 9 + [20]
+    assert max(sizes) == 60 and sorted(sizes)[-2] <= 30
