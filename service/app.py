@@ -32,7 +32,6 @@ log = logging.getLogger("service")
 
 ROUTERS = (
     telemetry.router,
-    health.router,
     twins.router,
     jobs.calibrations,
     jobs.diagnoses,
@@ -120,6 +119,7 @@ def create_app(
     _describe_access(app)
     for router in ROUTERS:
         app.include_router(router, dependencies=[Depends(known_parameters)])
+    app.include_router(health.router)  # a probe may carry anything against caches
     app.include_router(dashboard.router)
     for path, files in dashboard.assets().items():
         app.mount(path, files, name=path)
