@@ -107,13 +107,18 @@ def by_effect(rows: Sequence[Row]) -> str:
 
 
 def worst(rows: Sequence[Row], n: int = 10) -> str:
-    """Return the cases that were missed, worst held-out error first, with what was said instead."""
-    missed = [r for r in rows if (r["effect"] and r["group"] in ("network", "fem") and not r["listed"])]
-    missed += [r for r in rows if r["group"] == "clean" and r["findings"]]
-    missed.sort(key=lambda r: -r["after_K"] / (r["known_K"] or r["noise_K"]))
+    """Return the worst cases with what was said: the missed ones, then those whose held-out error stays furthest above
+    the noise."""
+
+    def missed(row: Row) -> bool:
+        """Whether it was named wrongly or not at all, or healthy and named."""
+        return bool(row["findings"]) if row["group"] == "clean" else not row["listed"]
+
+    inside = [r for r in rows if r["group"] != "outside"]
+    inside.sort(key=lambda r: (not missed(r), -r["after_K"] / r["noise_K"]))
     table = []
-    for r in missed[:n]:
+    for r in inside[:n]:
         said = "; ".join(f"{f['effect']} {f['where']}" for f in r["findings"]) or r["verdict"]
         errors = [f"{r[key] or float('nan'):.3f}" for key in ("before_K", "after_K", "known_K")]
-        table.append([r["task"], str(r["where"]), said, *errors])
-    return markdown_table(["case", "place", "said", "before, K", "after, K", "effect known, K"], table)
+        table.append([r["task"], str(r["where"]), said, *errors, f"{r['noise_K']:.3f}"])
+    return markdown_table(["case", "place", "said", "before, K", "after, K", "effect known, K", "noise, K"], table)
