@@ -154,7 +154,6 @@ ELSEWHERE = [
     Case("query: unknown at a job", "", 422, "x: unknown", path=f"{TWIN}/calibrations/1?x=", method="GET"),
     Case("query: unknown beside a body", {"horizon_s": 9}, 422, "step_s: unknown", path=f"{FORECASTS}?step_s=3"),
     Case("query: unknown at ingest", columns([7], T_px=[1]), 422, "dry_run: unknown", path=f"{TELEMETRY}?dry_run=1"),
-    Case("query: unknown at metrics", "", 422, "twin: unknown", path="/metrics?twin=benchsat", method="GET"),
     Case("query: one point", "", 422, "max_points", path=TELEMETRY + "?max_points=1", method="GET"),
     Case("spec: not JSON", "{", 400, "body", path="/v1/twins"),
     Case("spec: endless nesting", "[" * 100_000, 400, "body", path="/v1/twins"),
