@@ -29,7 +29,7 @@ from twin_core.fem.signals import AnySignal
 from twin_core.fem.thermostat import Thermostat
 from twin_core.network.quantities import Name, Positive, Temperature
 from twin_core.network.spec import Channel
-from twin_core.network.spec_io import read_mapping
+from twin_core.network.spec_io import read_model
 from twin_core.units import parse_instant_ns
 
 MOST_CELLS = 250_000
@@ -253,20 +253,8 @@ def _one_line(error: ValidationError) -> str:
 
 
 def load_scenario(source: Path | str | dict[str, Any]) -> Scenario:
-    """Return the validated scenario from a YAML or JSON file, or from its parsed mapping.
-
-    Raises
-    ------
-    SpecError
-        With one line that names the file and the field, and says what is wrong.
-    """
-    prefix = "" if isinstance(source, dict) else f"{source}: "
-    data = source if isinstance(source, dict) else read_mapping(Path(source))
-    try:
-        return Scenario.model_validate(data)
-    except (ValidationError, SpecError) as error:
-        message = _one_line(error) if isinstance(error, ValidationError) else str(error)
-        raise SpecError(prefix + message) from error
+    """Return the validated scenario from a YAML or JSON file, or from its parsed mapping; SpecError as ``read_model``."""
+    return read_model(source, Scenario, _one_line)
 
 
 __all__ = ["Scenario", "load_scenario"]

@@ -1,5 +1,6 @@
 """Signals over time that drive a scenario: one small class each, a function of time once a seed is given."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal, Self
@@ -33,9 +34,9 @@ class Signal(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     needs_date: ClassVar[bool] = False
 
+    @abstractmethod
     def realise(self, span: Span) -> Path:
         """Return the signal as a function of time, valid over the span."""
-        raise NotImplementedError(f"signal {type(self).__name__} defines no path")
 
 
 class Constant(Signal):

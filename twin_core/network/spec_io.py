@@ -1,16 +1,18 @@
 """Specifications as files and plain data, with one clear message for what is wrong."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from twin_core.errors import SpecError
 from twin_core.network.quantities import NAME, TWIN_ID
 from twin_core.network.spec import TwinSpec
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def _one_line(error: ValidationError) -> str:
@@ -124,8 +126,19 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return data
 
 
-def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
-    """Return the validated specification from a YAML or JSON file, or from its parsed mapping.
+def read_model(
+    source: Path | str | dict[str, Any], kind: type[Model], in_words: Callable[[ValidationError], str]
+) -> Model:
+    """Return what a YAML or JSON file, or its parsed mapping, describes.
+
+    Parameters
+    ----------
+    source
+        File or mapping.
+    kind
+        What it should describe.
+    in_words
+        Says in one line which field is wrong, and how.
 
     Raises
     ------
@@ -135,9 +148,14 @@ def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
     prefix = "" if isinstance(source, dict) else f"{source}: "
     data = source if isinstance(source, dict) else read_mapping(Path(source))
     try:
-        return TwinSpec.model_validate(data)
-    except ValidationError as error:
-        raise SpecError(prefix + _one_line(error)) from error
+        return kind.model_validate(data)
+    except (ValidationError, SpecError) as error:
+        raise SpecError(prefix + (in_words(error) if isinstance(error, ValidationError) else str(error))) from error
+
+
+def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
+    """Return the validated specification from a YAML or JSON file, or from its parsed mapping; SpecError as above."""
+    return read_model(source, TwinSpec, _one_line)
 
 
 def dump_spec(spec: TwinSpec) -> dict[str, Any]:

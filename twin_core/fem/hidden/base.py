@@ -1,5 +1,6 @@
 """What a hidden effect is: declared in a scenario, felt by the field, never told to the telemetry."""
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
@@ -137,9 +138,9 @@ class HiddenEffect(BaseModel):
 class LumpedHeat(HiddenEffect):
     """Base of effects that are heat into whole regions, spread evenly over each, driven by region means."""
 
+    @abstractmethod
     def heats_W(self, moment: Moment) -> Mapping[str, float]:
         """Return region -> heat (W), positive into the region."""
-        raise NotImplementedError(f"effect {type(self).__name__} defines no heat")
 
     def bind(self, plant: Plant) -> Bound | None:
         """Spread the heats over their regions."""

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import model_validator
 
-from twin_core.fem.hidden.base import Bound, Declared, LumpedHeat, Moment, Plant, spread
+from twin_core.fem.hidden.base import Bound, Declared, HiddenEffect, LumpedHeat, Moment, Plant, spread
 from twin_core.network.quantities import Name, Number, Positive, Temperature
 
 
@@ -77,7 +77,7 @@ class ProportionalHeater(LumpedHeat):
         return {self.node: float(np.clip(self.k_W_per_K * (self.T_set_K - moment.mean_K(self.node)), 0.0, self.Q_W))}
 
 
-class ThermostatHeater(LumpedHeat):
+class ThermostatHeater(HiddenEffect):
     """Full power once below T_on until above T_off (hysteresis); it looks once per step."""
 
     effect: Literal["thermostat_heater"]
