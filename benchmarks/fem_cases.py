@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.network_cases import Case
+from benchmarks.case import Case, Truth, trace_of
 from twin_core.fem.demo import DEMO_EFFECTS, NODES, PAYLOADS, SUNS, demo_scenario
 from twin_core.fem.scenario import load_scenario
 from twin_core.fem.simulate import Simulation, simulate
@@ -142,10 +142,16 @@ def fem_case(effect: str | None, seed: int) -> Case:
         rng = np.random.default_rng([seed, 31, *effect.encode()])
         drawn = {"effect": effect, **FURTHER[effect](rng, _clean(seed), scenario.time.duration_s)}
         scenario = load_scenario(scenario.model_dump(mode="json", exclude_none=True) | {"hidden": [drawn]})
-    where = scenario.hidden[0].where if scenario.hidden else {}
-    parameters = scenario.hidden[0].parameters if scenario.hidden else {}
     done = simulate(scenario)
-    return Case(spec, done.record, effect, where, _node_temperatures(done), parameters.get("time"), parameters)
+    record, noise_K = done.record, scenario.sensors[0].noise_std_K
+    truths: tuple[Truth, ...] = ()
+    if effect is not None:
+        hidden = scenario.hidden[0]
+        # The noise of a seed is the same whatever is hidden: the difference is the effect's own.
+        moved = np.stack([record.values[f"T_{node}"] - _clean(seed)[node] for node in NODES], axis=1)
+        onset_s = hidden.parameters.get("time")
+        truths = (Truth(effect, hidden.where, hidden.parameters, onset_s, trace_of(moved, noise_K)),)
+    return Case(spec, record, truths, _node_temperatures(done), noise_K)
 
 
 @lru_cache(maxsize=4)
@@ -156,4 +162,5 @@ def _clean(seed: int) -> Clean:
 
 def _node_temperatures(done: Simulation) -> np.ndarray:
     """Return the sensors' noise-free readings, (n_times, n_nodes)."""
-    return np.stack([done.truth.temperature_K[f"T_{node}"] for node in NODES], axis=1)
+    fine = done.truth
+    return np.stack([np.interp(done.record.time_s, fine.time_s, fine.temperature_K[f"T_{n}"]) for n in NODES], axis=1)

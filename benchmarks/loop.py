@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bands import Row
+from benchmarks.case import Case
 from benchmarks.loop_cases import FIRST_SEED, GROUPS, N_CLEAN, N_NETWORKS, Task, suite
 from benchmarks.loop_table import save_tables
-from benchmarks.network_cases import Case
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover import close_loop
 from twin_core.discover.confirm import Trial, try_effects, try_on_trajectories

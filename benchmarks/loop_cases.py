@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 
+from benchmarks.case import Case
 from benchmarks.fem_cases import FEM_EFFECTS, fem_case
 from benchmarks.hidden_effects import HIDDEN
-from benchmarks.network_cases import Case, network_case
+from benchmarks.network_cases import network_case
 from benchmarks.outside_vocabulary import OUTSIDE
 
 GROUPS = ("network", "fem", "clean", "outside")

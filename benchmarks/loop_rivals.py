@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.bands import Row
+from benchmarks.case import Case
 from benchmarks.loop import HOLDOUT, place, run_all
 from benchmarks.loop_cases import Task, suite
 from benchmarks.markdown import markdown_table, save_table
-from benchmarks.network_cases import Case
 from benchmarks.rival_bic import greedy_bic
 from benchmarks.rival_residual import IN_LIBRARY, Regressed, residual_polynomial, rms_error_K, sindy
 from twin_core.calibrate.second_order import fit_network, to_model

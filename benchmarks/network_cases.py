@@ -1,36 +1,15 @@
 """Seeded spacecraft networks with an undeclared effect, simulated by SciPy: truth that our own solver has no part in."""
 
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
+from benchmarks.case import Case, Truth, trace_of
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_world import NOTHING, SPACE_K, World
 from benchmarks.outside_vocabulary import OUTSIDE
-from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
-
-TRAINING_SHARE = 0.7
-
-
-@dataclass(frozen=True)
-class Case:
-    """One case: what the operator declares and sees, and what is really there (None on a healthy spacecraft).
-
-    ``trace`` is how far the effect moves the readings of the training part, rms over the noise: a heater that starts to
-    work in the hold-out leaves none, and nobody can find it.
-    """
-
-    spec: TwinSpec
-    record: Record
-    effect: str | None
-    where: dict[str, Any]
-    truth_K: np.ndarray
-    onset_s: float | None = None
-    parameters: dict[str, Any] = field(default_factory=dict)
-    trace: float = float("inf")
 
 
 def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: float = 60.0) -> Case:
@@ -89,5 +68,6 @@ def network_case(effect: str | None, seed: int, *, n_orbits: int = 12, dt_s: flo
         }
     )
     record = Record(world.time_s, values, None, f"case-{seed}")
-    trace = float(np.sqrt(np.mean((read - healthy)[: int(TRAINING_SHARE * world.time_s.size)] ** 2))) / noise
-    return Case(spec, record, effect, hidden.where, truth, hidden.onset_s, hidden.parameters, trace)
+    trace = trace_of(read - healthy, noise)
+    truths = () if effect is None else (Truth(effect, hidden.where, hidden.parameters, hidden.onset_s, trace),)
+    return Case(spec, record, truths, truth, noise)

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 
 pytest.importorskip("pysindy", reason="the benchmarks' extra is not installed")
 
+from benchmarks.case import Case, Truth
 from benchmarks.loop_rivals import rivals_of
-from benchmarks.network_cases import Case
 from benchmarks.rival_features import FeatureHeat, library, powers
 from benchmarks.rival_residual import rms_error_K
 from twin_core.discover.holdout import split_fraction
@@ -64,9 +64,8 @@ def case() -> Case:
         }
     )
     values = {"T_room": room, "T0": read[:, 0], "T1": read[:, 1], "P0": power}
-    return Case(
-        spec, Record(time_s, values, None, "two-blocks"), "leak_to_boundary", {"node": "n1", "boundary": "room"}, truth
-    )
+    leak = Truth("leak_to_boundary", {"node": "n1", "boundary": "room"})
+    return Case(spec, Record(time_s, values, None, "two-blocks"), (leak,), truth, NOISE_K)
 
 
 @pytest.mark.parametrize("name", ["SINDy", "greedy BIC"])

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.network_cases import Case, network_case
+from benchmarks.case import Case
+from benchmarks.network_cases import network_case
 from twin_core.discover import close_loop
 from twin_core.discover.holdout import predict, split_burn_in
 from twin_core.discover.loop import ClosedLoop
