@@ -9,11 +9,15 @@ from benchmarks.fem_cases import FEM_EFFECTS, fem_case
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_cases import network_case
 from benchmarks.outside_vocabulary import OUTSIDE
+from benchmarks.solid_cases import solid_case
+from benchmarks.worlds.hidden import EFFECTS
 
-GROUPS = ("network", "fem", "clean", "outside")
+GROUPS = ("network", "fem", "fem2", "clean", "clean_fem2", "outside")
 N_NETWORKS = 5
 N_FEM = 1
+N_FEM2 = 1
 N_CLEAN = 300
+N_CLEAN_FEM2 = 13
 N_OUTSIDE = 2
 LEAST_TRACE = 2.0
 """Effects that move the readings of the training part less than this, in units of their noise, are drawn again."""
@@ -30,7 +34,7 @@ class Task:
     Attributes
     ----------
     group
-        "network", "fem", "clean" or "outside".
+        One of ``GROUPS``.
     effect
         What is hidden; None in clean cases.
     seed
@@ -48,6 +52,8 @@ class Task:
 
     def build(self) -> Case:
         """Simulate the case. Clean records vary in length and sampling as those with effects do."""
+        if self.group in ("fem2", "clean_fem2"):
+            return solid_case(self.effect, self.seed)
         if self.group == "fem":
             return fem_case(self.effect, self.seed)
         if self.group == "clean" and self.seed % 10 == 0:
@@ -72,6 +78,8 @@ def suite(
             Task("network", e, first_seed + 10 * i + k) for i, e in enumerate(HIDDEN) for k in range(n_networks)
         ],
         "fem": [Task("fem", e, first_seed + 10 * i + k) for i, e in enumerate(FEM_EFFECTS) for k in range(N_FEM)],
+        "fem2": [Task("fem2", e, first_seed + 10 * i + k) for i, e in enumerate(EFFECTS) for k in range(N_FEM2)],
+        "clean_fem2": [Task("clean_fem2", None, first_seed + k) for k in range(N_CLEAN_FEM2)],
         "clean": [Task("clean", None, first_seed + k) for k in range(n_clean)],
         "outside": [
             Task("outside", e, first_seed + 10 * i + k) for i, e in enumerate(OUTSIDE) for k in range(N_OUTSIDE)
