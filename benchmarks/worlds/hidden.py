@@ -210,9 +210,10 @@ def channel_heat_load(s: Scene) -> Draft:
 
 
 def thermostat_heater(s: Scene) -> Draft:
-    """Draw a heater with hysteresis that looks once per step at the mean over its spot."""
+    """Draw a heater with hysteresis whose controller looks at the mean over its spot now and again."""
     node = s.node()
     spot = s.spot(node)
+    look_s = s.craft.sample_s * s.craft.refined / s.craft.per_sample
     on_K = s.quantiles(node, float(s.rng.uniform(0.25, 0.6)))[0]
     low, high = s.quantiles(node, 0.02, 0.98)
     off_K = on_K + max(0.5, float(s.rng.uniform(0.1, 0.3)) * (high - low))
@@ -221,6 +222,8 @@ def thermostat_heater(s: Scene) -> Draft:
         relay = [False]
 
         def after(time_s: float, x: np.ndarray) -> None:
+            if abs(time_s / look_s - round(time_s / look_s)) > 1e-6:
+                return
             here = float(spot @ x)
             relay[0] = here < on_K or (relay[0] and here < off_K)
 
