@@ -68,19 +68,20 @@ NOTHING = Hidden({})
 class World:
     """A random spacecraft: capacities, a connected graph, radiators, sun and payload heat."""
 
-    def __init__(self, rng: np.random.Generator, n_orbits: int, dt_s: float) -> None:
+    def __init__(self, rng: np.random.Generator, n_orbits: int, dt_s: float, n_nodes: int | None = None) -> None:
         self.rng = rng
-        self.n = int(rng.integers(4, 8))
+        self.n = int(rng.integers(4, 8)) if n_nodes is None else n_nodes
         self.period_s = float(rng.uniform(5400, 6000))
         self.time_s = np.arange(0.0, n_orbits * self.period_s, dt_s)
         self.capacity = np.exp(rng.uniform(np.log(2e3), np.log(3e4), self.n))
         self.edges = [(int(rng.integers(0, i)), i) for i in range(1, self.n)]
-        for _ in range(int(rng.integers(0, 3))):
+        for _ in range(int(rng.integers(0, max(3, self.n // 3)))):
             a, b = sorted(rng.choice(self.n, 2, replace=False).tolist())
             if (a, b) not in self.edges:
                 self.edges.append((a, b))
         self.conductance = np.exp(rng.uniform(np.log(0.5), np.log(6.0), len(self.edges)))
-        self.radiators = {int(i): float(rng.uniform(0.1, 0.5)) for i in rng.choice(self.n, 2, replace=False)}
+        n_radiators = max(2, self.n // 5)
+        self.radiators = {int(i): float(rng.uniform(0.1, 0.5)) for i in rng.choice(self.n, n_radiators, replace=False)}
         self.radiators.setdefault(int(np.argmax(self.capacity)), 0.2)
         self._inputs()
         self.room_K = 288.0 + 4.0 * np.sin(2 * np.pi * self.time_s / (7.3 * self.period_s))
@@ -95,7 +96,7 @@ class World:
             node: 1.2 * load * s * np.maximum(np.sin(phase + self.rng.uniform(-0.5, 0.5)), 0) * lit
             for node, s in zip(self.radiators, share, strict=True)
         }
-        nodes = self.rng.choice(self.n, min(3, self.n), replace=False)
+        nodes = self.rng.choice(self.n, max(min(3, self.n), self.n // 5), replace=False)
         self.power = {}
         for node in nodes:
             switches = np.repeat(self.rng.integers(0, 4, self.time_s.size // 31 + 1), 31)[: self.time_s.size]
