@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.case import TRAINING_SHARE
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import fit_trajectories, prepare
+from twin_core.calibrate.second_order import fit_trajectories
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
@@ -53,15 +53,6 @@ def calibrated(spec: TwinSpec, record: Record) -> DeclaredFit:
     values = calibration.network.parameters.as_dict()
     jacobian = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
     return DeclaredFit(values, calibration.residuals[0], _orthonormal(jacobian))
-
-
-def about_truth(spec: TwinSpec, record: Record) -> DeclaredFit:
-    """Return a declared network whose guesses are the truth, as it is."""
-    problem, _ = prepare(spec, [training_part(record)])
-    unknowns = problem.start()
-    fit = problem.solve(unknowns)
-    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(unknowns, fit))
-    return DeclaredFit(problem.network.parameters.as_dict(), problem.residuals(fit)[0], _orthonormal(jacobian))
 
 
 def _orthonormal(jacobian: np.ndarray) -> np.ndarray:

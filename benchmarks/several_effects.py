@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.case import Case, Truth, trace_of
-from benchmarks.declared_fit import DeclaredFit, about_truth, correlation
+from benchmarks.declared_fit import DeclaredFit, calibrated, correlation
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_cases import declared, inputs
 from benchmarks.network_world import Hidden, World
@@ -62,7 +62,7 @@ class Scene:
     noise_K
         Their noise.
     fit
-        The declared network about the truth.
+        The declared network calibrated to the healthy record.
     """
 
     world: World
@@ -131,7 +131,7 @@ def _scene(kind: str, rng: np.random.Generator) -> Scene:
     spec = declared(world, world.capacity.tolist(), world.conductance.tolist(), unread, "several")
     values = _driving(world) | {f"T{i}": healthy[:, i] + rng.normal(0, noise, len(healthy)) for i in range(world.n)}
     read = tuple(i for i in range(world.n) if i not in unread)
-    return Scene(world, begun, healthy, read, noise, about_truth(spec, Record(world.time_s, values)))
+    return Scene(world, begun, healthy, read, noise, calibrated(spec, Record(world.time_s, values)))
 
 
 def _driving(world: World) -> dict[str, np.ndarray]:

@@ -467,7 +467,7 @@ def boundary_lag(s: Scene) -> Draft:
         )
 
     scale = s.craft.duration_s
-    return Draft(make, 0.03 * scale, 3.0 * s.craft.sample_s, 0.3 * scale)
+    return Draft(make, 0.02 * scale, 3.0 * s.craft.sample_s, 0.1 * scale)
 
 
 def _lagged(drive: Drive, given: np.ndarray, tau_s: float) -> np.ndarray:

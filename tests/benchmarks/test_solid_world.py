@@ -6,12 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.solid_cases import solid_case
 from benchmarks.worlds.body import FACES, WHOLE, Body, angle_bracket, block, tube
 from benchmarks.worlds.field import Contact, Plan, assemble
 from benchmarks.worlds.hidden import EFFECTS, Scene, lag_exact
 from benchmarks.worlds.orbits import EARTH_M, MU_M3_PER_S2, Orbit
 from benchmarks.worlds.spacecraft import Spacecraft, draw_spacecraft
 from benchmarks.worlds.stepping import GAMMA, SIGMA_W_PER_M2_K4, SPACE_K, Acting, Drive, Stepper, steady
+from twin_core.calibrate.second_order import fit_trajectories
 
 CAPACITY = 2.4e6
 
@@ -237,3 +239,20 @@ def test_a_face_towards_the_sun_gets_the_solar_constant_and_one_away_nothing() -
     t = np.linspace(0.0, 0.2 * still.period_s, 50)
     assert still.flux_W_per_m2(np.array([1.0, 0.0, 0.0]), t)[0] == pytest.approx(1361.0)
     assert still.flux_W_per_m2(np.array([-1.0, 0.0, 0.0]), t)[0] == pytest.approx(0.0)
+
+
+def test_a_case_is_told_by_its_sensors_and_missed_by_its_network() -> None:
+    case = solid_case("sensor_drift", 3)
+    (truth,) = case.truths
+    ratio = case.facts["misfit_over_noise"]
+    assert 1.0 <= ratio <= 2.0
+    assert max(2.0, 3.0 * ratio) <= truth.trace <= 30.0
+    assert max(2.0, 1.5 * ratio) <= truth.trace_beyond <= truth.trace
+    drift = truth.parameters["d_K_per_s"] * case.record.time_s[: int(0.7 * case.record.time_s.size)]
+    n = len([name for name in case.record.values if name.startswith("T_")]) - sum(
+        b.channel is not None for b in case.spec.boundaries.values()
+    )
+    n += case.facts["unread"] is not None
+    assert truth.trace == pytest.approx(np.sqrt(np.mean(drift**2) / n) / case.noise_K, rel=1e-6)
+    fit = fit_trajectories(case.spec, [case.record])
+    assert fit.optimum.status == "converged"
