@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from benchmarks.case import read_case, save_case
+from benchmarks.combined_effects import distance, together, wandering
 from benchmarks.declared_fit import calibrated
 from benchmarks.hidden_effects import HIDDEN
 from benchmarks.network_cases import declared, inputs, network_case
 from benchmarks.network_world import NOTHING, Hidden, World
-from benchmarks.several_effects import KINDS, distance, several_case, together, wandering
-from benchmarks.worlds.hidden import lag_exact
+from benchmarks.several_effects import KINDS, several_case
+from benchmarks.worlds.hidden.sensing import lag_exact
 from twin_core.telemetry import Record
 
 

@@ -9,7 +9,8 @@ import pytest
 from benchmarks.solid_cases import solid_case
 from benchmarks.worlds.body import FACES, WHOLE, Body, angle_bracket, block, tube
 from benchmarks.worlds.field import Contact, Plan, assemble
-from benchmarks.worlds.hidden import EFFECTS, Scene, lag_exact
+from benchmarks.worlds.hidden import EFFECTS, Scene
+from benchmarks.worlds.hidden.sensing import lag_exact
 from benchmarks.worlds.orbits import EARTH_M, MU_M3_PER_S2, Orbit
 from benchmarks.worlds.spacecraft import Spacecraft, draw_spacecraft
 from benchmarks.worlds.stepping import GAMMA, SIGMA_W_PER_M2_K4, SPACE_K, Acting, Drive, Stepper, steady
