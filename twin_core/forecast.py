@@ -15,6 +15,7 @@ from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.extrapolation import extrapolated_variance_K2, extrapolations, in_words
 from twin_core.simulate.forcing import Forcing, build_forcing
+from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.response import sensitivities
 from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
@@ -104,7 +105,8 @@ def forecast(
     variance += extrapolated_variance_K2(network, [b for _, b in beyond], forcing, path, network.sensor_node)
     std, mean = np.sqrt(variance)[wanted], read[wanted]
     bands = {q: mean + norm.ppf(q) * std for q in quantiles}
-    return Forecast(future.time_s[wanted], model.spec.sensors, mean, bands, in_words(beyond))
+    notices = (*orbit_notices(model.spec, [future]), *in_words(beyond))
+    return Forecast(future.time_s[wanted], model.spec.sensors, mean, bands, notices)
 
 
 def _sampling_s(record: Record) -> float:

@@ -10,6 +10,9 @@ from twin_core.errors import TelemetryError
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
+J2000_NS = 946_728_000_000_000_000
+"""Unix nanoseconds of J2000.0, 2000-01-01 12:00 (Julian day 2451545.0)."""
+
 
 def to_si(values: FloatArray, unit: str | None) -> FloatArray:
     """Return ``values`` in SI: degC becomes K, every other unit stays as it is."""
@@ -59,6 +62,6 @@ def sun_distance_au(unix_ns: int, time_s: FloatArray) -> FloatArray:
     Low-precision formula of the Astronomical Almanac, section C: g = 357.528 deg + 0.9856003 n,
     R = 1.00014 - 0.01671 cos g - 0.00014 cos 2g, n in days from J2000.0 (valid 1950 to 2050).
     """
-    days = (unix_ns - 946_728_000_000_000_000) / 86_400e9 + np.asarray(time_s) / 86_400.0
+    days = (unix_ns - J2000_NS) / 86_400e9 + np.asarray(time_s) / 86_400.0
     mean_anomaly = np.radians(357.528 + 0.9856003 * days)
     return 1.00014 - 0.01671 * np.cos(mean_anomaly) - 0.00014 * np.cos(2.0 * mean_anomaly)

@@ -24,6 +24,7 @@ from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec import TwinSpec
+from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
@@ -297,6 +298,7 @@ def _summary(
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
+    heard += orbit_notices(network.spec, [s.record for s in problem.segments])
     return {
         "train": {
             "start": first.present(first.time_s[0]),

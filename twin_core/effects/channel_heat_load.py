@@ -8,8 +8,10 @@ import numpy as np
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
+from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
 from twin_core.network.terms import SteeredTable, TableLoad, nearest
+from twin_core.orbit.environment import BETA
 
 N_KNOTS = 6
 MIN_SHARE = 0.02
@@ -65,9 +67,14 @@ class ChannelHeatLoad(Effect):
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:
-        """Yield every node with every auxiliary channel, but where a table of that channel is declared."""
+        """Yield every node with every auxiliary channel, but where a table of that channel is declared.
+
+        Not the parts of a quaternion, which mean nothing one by one, nor the orbit's angle to the Sun, which moves so
+        slowly that it would explain any drift.
+        """
+        mute = {f"{PREFIX}{BETA}", *layout.spec.attitude_channels}
         declared = {(load.channel, load.node) for load in layout.spec.loads if load.table is not None}
-        auxiliary = [name for name, channel in layout.spec.channels.items() if channel.kind == "auxiliary"]
+        auxiliary = [name for name, c in layout.spec.inputs.items() if c.kind == "auxiliary" and name not in mute]
         for node in layout.declared_nodes:
             for channel in auxiliary:
                 if (channel, node) not in declared:
@@ -80,7 +87,7 @@ class ChannelHeatLoad(Effect):
         if name not in survey.along.inputs:
             return
         series = survey.along.inputs[name]
-        levels = survey.layout.spec.channels[name].levels or np.unique(series).size <= 6
+        levels = survey.layout.spec.inputs[name].levels or np.unique(series).size <= 6
         knots = survey.channel_levels.get(name) or tuple(np.unique(series))
         if not levels:
             knots = even_knots(series)

@@ -55,8 +55,8 @@ class InputPowerLaw(Effect):
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:
-        """Yield every channel that drives a load."""
-        yield from driving_channels(layout)
+        """Yield every channel that drives a load, but those of the orbit: what light a surface absorbs is a share of it."""
+        yield from (where for where in driving_channels(layout) if where["channel"] not in layout.spec.orbit_channels)
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:

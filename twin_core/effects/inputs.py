@@ -58,15 +58,13 @@ def correct_channel(effect: Effect, layout: Layout, shape: Shape, dated: bool | 
 
 def driving_channels(layout: Layout) -> Iterable[Where]:
     """Yield every channel that drives a declared load other than a table."""
-    yield from (
-        {"channel": name} for name in layout.spec.channels if any(x.table is None for x in layout.loads_of(name))
-    )
+    yield from ({"channel": name} for name in layout.spec.inputs if any(x.table is None for x in layout.loads_of(name)))
 
 
 def gain_is_known(layout: Layout, channel: str) -> bool:
     """Return whether a channel's declared loads all have a known gain."""
     kinds = [
-        (load.gain is None and layout.spec.channels[channel].unit == "W") or (load.gain and load.gain.value is not None)
+        (load.gain is None and layout.spec.inputs[channel].unit == "W") or (load.gain and load.gain.value is not None)
         for load in layout.loads_of(channel)
         if load.table is None
     ]

@@ -226,8 +226,9 @@ class OrbitFace(Signal):
 
     def realise(self, span: Span) -> Path:
         """Return the absorbed heat over time."""
-        from twin_core.fem.illumination import face_heat
-        from twin_core.fem.orbit import KeplerOrbit, Orbit, TleOrbit
+        from twin_core.orbit.environment import face_heat
+        from twin_core.orbit.path import KeplerOrbit, Orbit
+        from twin_core.orbit.tle import TleOrbit
 
         orbit: Orbit
         if self.elements is not None:
@@ -235,10 +236,10 @@ class OrbitFace(Signal):
             orbit = KeplerOrbit(**numbers, epoch_ns=parse_instant_ns(self.elements.epoch))
         else:
             orbit = TleOrbit(*self.tle)  # type: ignore[misc]  # validated: one of the two is there
-        epoch_ns = span.epoch_ns or 0
+        epoch_ns, frame = span.epoch_ns or 0, {"nadir": "orbit"}.get(self.attitude, self.attitude)
 
         def path(time_s: FloatArray) -> FloatArray:
-            heat = face_heat(orbit, self.attitude, self.normal, epoch_ns, np.ravel(time_s))
+            heat = face_heat(orbit, frame, self.normal, epoch_ns, np.ravel(time_s))
             absorbed = self.absorptance * (heat.solar + heat.albedo) + self.emissivity * heat.infrared
             return self.area_m2 * absorbed.reshape(np.shape(time_s))
 

@@ -310,7 +310,7 @@ def _conductance(between: tuple[str, str], quantity: Quantity | None) -> Paramet
 
 def _load_term(layout: Layout, load: Load) -> Term:
     """Return the term of one declared load; a gain is known (one) unless it is declared or the channel is in percent."""
-    channel: Channel = layout.spec.channels[load.channel]
+    channel: Channel = layout.spec.inputs[load.channel]
     node = layout.node(load.node)
     if load.table is not None:
         key = (load.channel, load.node)
@@ -320,7 +320,7 @@ def _load_term(layout: Layout, load: Load) -> Term:
         values = tuple(real(f"table:{load.channel}|{load.node}[{k:g}]", "W", 0.0) for k in knots)
         return TableLoad(node, load.channel, tuple(knots), channel.levels, load.weight, load.solar, values)
     unknown = load.gain is not None or channel.unit != "W"
-    unit = "W/%" if channel.unit == "percent" else ""
+    unit = {"percent": "W/%", "W/m2": "m2"}.get(channel.unit or "", "")
     gain = (
         _quantity(gain_name(load), unit, load.gain, 1.0)
         if unknown

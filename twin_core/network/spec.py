@@ -1,12 +1,14 @@
 """The twin specification: what the operator declares, and whether it fits together."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, StrictBool, field_validator, model_validator
 
 from twin_core.errors import TelemetryError
+from twin_core.network.orbit_block import PREFIX, OrbitBlock
 from twin_core.network.quantities import (
     TWIN_ID,
     Fraction,
@@ -173,6 +175,7 @@ class TwinSpec(Strict):
     loads: tuple[Load, ...] = ()
     exclude: tuple[Interval, ...] = ()
     criteria: Criteria = Criteria()
+    orbit: OrbitBlock | None = None
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
@@ -206,7 +209,17 @@ class TwinSpec(Strict):
             yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
             if (radiator.node, radiator.sink) in [(r.node, r.sink) for r in self.radiators[:i]]:
                 yield f"radiators[{i}]: '{radiator.node}' radiates to '{radiator.sink}' twice; add the areas"
+        yield from self._check_orbit()
         yield from self._check_loads(nodes)
+
+    def _check_orbit(self) -> Iterable[str]:
+        for name in () if self.orbit is None else self.orbit.units:
+            if name in self.channels:
+                yield f"channels.{name}: comes from the orbit; remove it, or declare no orbit"
+        for name in self.attitude_channels:
+            yield from self._check_channel("orbit.attitude.quaternion_channels", name, ("auxiliary",))
+            if self.channels[name].levels:
+                yield f"orbit.attitude.quaternion_channels: channel '{name}' has levels; a quaternion has none"
 
     def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
         pairs: set[frozenset[str]] = set()
@@ -227,9 +240,11 @@ class TwinSpec(Strict):
         for i, load in enumerate(self.loads):
             yield from self._check_end(f"loads[{i}].node", load.node, nodes)
             yield from self._check_channel(f"loads[{i}].channel", load.channel, ("power", "auxiliary"))
+            if load.solar and load.channel in self.orbit_channels:
+                yield f"loads[{i}].solar: '{load.channel}' follows the Sun's distance already; leave it out"
             if (load.channel, load.node) in [(other.channel, other.node) for other in self.loads[:i]]:
                 yield f"loads[{i}]: channel '{load.channel}' heats node '{load.node}' twice; add the weights"
-            channel = self.channels[load.channel]
+            channel = self.inputs[load.channel]
             if load.table is None and channel.kind == "auxiliary":
                 yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
             if load.table is not None and channel.kind == "power":
@@ -245,10 +260,13 @@ class TwinSpec(Strict):
                 yield f"loads: the weights of channel '{name}' add to {total:g}; they may add to 1 at most"
 
     def _check_channel(self, field: str, name: str, kinds: tuple[str, ...]) -> Iterable[str]:
-        if name not in self.channels:
-            yield f"{field}: unknown channel '{name}'; declare it under channels (known: {', '.join(self.channels) or 'none'})"
-        elif self.channels[name].kind not in kinds:
-            yield f"{field}: channel '{name}' is {self.channels[name].kind}, must be {' or '.join(kinds)}"
+        if name not in self.inputs:
+            how = "declare it under channels"
+            if name.startswith(PREFIX):
+                how = "declare the orbit" if self.orbit is None else "correct its name"
+            yield f"{field}: unknown channel '{name}'; {how} (known: {', '.join(self.inputs) or 'none'})"
+        elif self.inputs[name].kind not in kinds:
+            yield f"{field}: channel '{name}' is {self.inputs[name].kind}, must be {' or '.join(kinds)}"
 
     @staticmethod
     def _check_end(field: str, name: str, known: list[str], what: str = "node") -> Iterable[str]:
@@ -259,6 +277,28 @@ class TwinSpec(Strict):
     def sensors(self) -> tuple[str, ...]:
         """Every sensor channel, in the order of the nodes."""
         return tuple(sensor for node in self.nodes for sensor in node.sensors)
+
+    @cached_property
+    def orbit_channels(self) -> Mapping[str, Channel]:
+        """What the orbit gives wherever the telemetry is dated: heat per area as power in W/m2, the others auxiliary."""
+        units = {} if self.orbit is None else self.orbit.units
+        return {
+            name: Channel.model_construct(
+                kind="power" if unit == "W/m2" else "auxiliary", unit=unit, interpolation="linear"
+            )
+            for name, unit in units.items()
+        }
+
+    @cached_property
+    def inputs(self) -> Mapping[str, Channel]:
+        """Every channel by its name: those of the telemetry, and those of the orbit."""
+        return {**self.channels, **self.orbit_channels}
+
+    @property
+    def attitude_channels(self) -> tuple[str, ...]:
+        """The telemetry that tells the attitude: four parts of a quaternion, scalar first, or none."""
+        told = None if self.orbit is None else self.orbit.attitude.quaternion_channels
+        return told or ()
 
     @property
     def used_channels(self) -> tuple[str, ...]:

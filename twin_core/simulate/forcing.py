@@ -11,6 +11,7 @@ from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.terms import Along
 from twin_core.simulate.kernels import GAMMA
+from twin_core.simulate.orbit_inputs import orbit_inputs
 from twin_core.telemetry import Record
 from twin_core.units import sun_distance_au
 
@@ -128,7 +129,7 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     inputs = {
         name: at_times(record, name, spec.channels[name].is_held, stage_time, interval=stage_interval)
         for name in _driving_channels(spec, record)
-    }
+    } | orbit_inputs(spec, record, begin, step, np.array([GAMMA, 1.0]))
     sample_step = np.concatenate([[0], np.cumsum(divisions)])
     sun = _sun_factor(spec, record, stage_time)
     start = float(record.time_s[0])
@@ -147,7 +148,7 @@ def _check_clock(network: Network, record: Record) -> None:
 
 def _driving_channels(spec: TwinSpec, record: Record) -> tuple[str, ...]:
     """Return the channels of declared loads, and every further power or auxiliary channel that the record has."""
-    declared = {load.channel for load in spec.loads}
+    declared = {load.channel for load in spec.loads} - spec.orbit_channels.keys()
     free = {
         name
         for name, channel in spec.channels.items()

@@ -1,4 +1,4 @@
-"""Real orbits: where a spacecraft is, from Keplerian elements or a two-line element set."""
+"""Where a spacecraft is: any orbit, and Keplerian elements with the drift by the Earth's oblateness."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -7,13 +7,9 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.constants import EARTH_GM_M3_PER_S2, EARTH_RADIUS_M
-from twin_core.errors import SpecError
 
 EARTH_J2 = 1.08262668e-3
 """Second zonal harmonic (EGM96)."""
-
-_J2000_NS = 946_728_000_000_000_000
-_DAY_NS = 86_400_000_000_000
 
 
 class Orbit(Protocol):
@@ -68,45 +64,6 @@ class KeplerOrbit:
         )
         cos, sin = np.cos(perigee)[:, None], np.sin(perigee)[:, None]
         return np.stack([cos * to_node + sin * across, -sin * to_node + cos * across], axis=-1)
-
-
-@dataclass(frozen=True)
-class TleOrbit:
-    """A two-line element set, propagated by SGP4 (frame TEME, which at this accuracy is the equator of date)."""
-
-    line_1: str
-    line_2: str
-
-    def state(self, epoch_ns: int, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return position (m) and velocity (m/s), each (n_times, 3).
-
-        Raises
-        ------
-        SpecError
-            If ``sgp4`` is not installed, the lines are no element set, or the orbit has decayed.
-        """
-        try:
-            from sgp4.api import Satrec
-        except ImportError as error:
-            raise SpecError("tle: needs the package sgp4; install it with 'pip install thermal-twin[orbit]'") from error
-        for number, line in enumerate((self.line_1, self.line_2), start=1):
-            _check_line(number, line)
-        satellite = Satrec.twoline2rv(self.line_1, self.line_2)
-        days = (epoch_ns - _J2000_NS) / _DAY_NS + np.asarray(time_s, dtype=float) / 86_400.0
-        whole = np.floor(days)
-        codes, position_km, velocity_km_per_s = satellite.sgp4_array(2_451_545.0 + whole, days - whole)
-        if codes.any():
-            raise SpecError(f"tle: SGP4 cannot propagate to the scenario's dates (code {int(codes.max())})")
-        return position_km * 1e3, velocity_km_per_s * 1e3
-
-
-def _check_line(number: int, line: str) -> None:
-    """Refuse a line that is no element line: SGP4 itself would read anything."""
-    if len(line) != 69 or not line.startswith(f"{number} "):
-        raise SpecError(f"tle: line {number} must have 69 characters and begin with '{number} ' (got {line!r})")
-    total = sum(int(c) if c.isdigit() else c == "-" for c in line[:68])
-    if str(total % 10) != line[68]:
-        raise SpecError(f"tle: checksum of line {number} is {line[68]}, must be {total % 10}; copy the line again")
 
 
 def solve_kepler(mean_anomaly: FloatArray, eccentricity: float) -> FloatArray:
