@@ -49,7 +49,7 @@ def tumbling_view_factor(distance: FloatArray) -> FloatArray:
 
 
 def spinning_view_factor(distance: FloatArray, cosine: FloatArray) -> FloatArray:
-    """Return the mean view factor of a plate that spins about an axis in its own plane, (n_times,), to 1e-3 of itself.
+    """Return the mean view factor of a plate that spins about an axis in its own plane, (n_times,), to 2e-3 of itself.
 
     Over a turn the positive part of the cosine to a direction has the mean sin(angle to the axis) / pi; this is
     integrated over the sphere's disc.
@@ -75,9 +75,8 @@ def spinning_view_factor(distance: FloatArray, cosine: FloatArray) -> FloatArray
 
 def mean_positive(level: FloatArray, swing: FloatArray) -> FloatArray:
     """Return the mean of max(0, level + swing cos(angle)) over a turn; ``swing`` is not negative."""
-    safe = np.where(swing > 0.0, swing, 1.0)
-    ratio = np.where(swing > 0.0, -level / safe, -np.sign(level))
-    lit = np.arccos(np.clip(ratio, -1.0, 1.0))
+    most = np.maximum(swing, np.abs(level))
+    lit = np.arccos(-level / np.where(most > 0.0, most, 1.0))  # half the angle over which the sum is positive
     return (level * lit + swing * np.sin(lit)) / np.pi
 
 

@@ -1,20 +1,14 @@
-"""Orbits against the two-body equation, Kepler's laws and SGP4."""
+"""Keplerian orbits against the two-body equation and Kepler's laws."""
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.constants import EARTH_GM_M3_PER_S2, EARTH_RADIUS_M
-from twin_core.errors import SpecError
-from twin_core.fem.orbit import EARTH_J2, KeplerOrbit, TleOrbit, solve_kepler
+from twin_core.orbit.path import EARTH_J2, KeplerOrbit, solve_kepler
 from twin_core.units import parse_instant_ns
 
 EPOCH_NS = parse_instant_ns("2026-03-01T00:00:00Z")
-# International Space Station, an element set of 2008 that SGP4's documentation prints.
-ISS = (
-    "1 25544U 98067A   08264.51782528 -.00002182  00000-0 -11606-4 0  2927",
-    "2 25544  51.6416 247.4627 0006703 130.5360 325.0288 15.72125391563537",
-)
 
 
 def test_keplers_equation_is_solved() -> None:
@@ -27,7 +21,7 @@ def test_keplers_equation_is_solved() -> None:
 
 def test_short_arc_equals_integration_with_oblateness_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without J2 the orbit is the solution of the two-body equation, by SciPy, to a metre over a revolution."""
-    monkeypatch.setattr("twin_core.fem.orbit.EARTH_J2", 0.0)
+    monkeypatch.setattr("twin_core.orbit.path.EARTH_J2", 0.0)
     orbit = KeplerOrbit(7_500e3, 0.05, 63.0, 40.0, 110.0, 20.0, EPOCH_NS)
     times_s = np.linspace(0.0, orbit.period_s, 30)
     place, speed = orbit.state(EPOCH_NS, times_s)
@@ -49,28 +43,3 @@ def test_node_of_a_sun_synchronous_orbit_turns_with_the_sun() -> None:
     node_deg = np.degrees(np.arctan2(poles[:, 0], -poles[:, 1]))
     assert (node_deg[1] - node_deg[0]) / 30.0 == pytest.approx(360.0 / 365.24, rel=0.01)
     assert EARTH_J2 > 0.0
-
-
-def test_element_set_agrees_with_its_own_kepler_orbit() -> None:
-    """SGP4 gives the station's height and inclination; speed and position obey the vis-viva equation."""
-    pytest.importorskip("sgp4", reason="two-line elements need the extra 'orbit'")
-    epoch_ns = parse_instant_ns("2008-09-20T12:25:40Z")
-    place, speed = TleOrbit(*ISS).state(epoch_ns, np.linspace(0.0, 5400.0, 20))
-    radius = np.linalg.norm(place, axis=1)
-    assert ((radius > EARTH_RADIUS_M + 330e3) & (radius < EARTH_RADIUS_M + 370e3)).all()
-    pole = np.cross(place, speed)
-    tilt_deg = np.degrees(np.arccos(pole[:, 2] / np.linalg.norm(pole, axis=1)))
-    np.testing.assert_allclose(tilt_deg, 51.64, atol=0.1)
-    energy = 0.5 * np.sum(speed**2, axis=1) - EARTH_GM_M3_PER_S2 / radius
-    np.testing.assert_allclose(energy / energy[0], 1.0, atol=2e-3)
-
-
-def test_a_decayed_or_broken_element_set_is_refused() -> None:
-    """A century later the station has decayed: a clear error instead of NaN; so with lines that are no set."""
-    pytest.importorskip("sgp4", reason="two-line elements need the extra 'orbit'")
-    with pytest.raises(SpecError, match="cannot propagate"):
-        TleOrbit(*ISS).state(parse_instant_ns("2108-01-01T00:00:00Z"), np.zeros(2))
-    with pytest.raises(SpecError, match="line 1 must have 69 characters"):
-        TleOrbit("nonsense", "more nonsense").state(EPOCH_NS, np.zeros(2))
-    with pytest.raises(SpecError, match="checksum of line 2 is 7, must be 8"):
-        TleOrbit(ISS[0], ISS[1].replace("51.6416", "52.6416")).state(EPOCH_NS, np.zeros(2))
