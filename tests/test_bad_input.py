@@ -86,6 +86,68 @@ SPECIFICATIONS: list[tuple[Edit, str]] = [
     (edit("criteria", to={"bias_K": float("inf")}), "criteria.bias_K"),
 ]
 
+TLE = [
+    "1 39444U 13066AE  16035.38257241  .00000865  00000-0  11531-3 0  9990",
+    "2 39444  97.7004  94.3150 0060634  98.1157 262.6940 14.80829622117779",
+]
+
+
+def orbit(attitude: Any = "nadir", **fields: Any) -> dict[str, Any]:
+    return {"tle": TLE, "attitude": attitude, **fields}
+
+
+def declare_orbit(**rest: Any) -> Edit:
+    """Return a change that declares an orbit, and replaces or adds other fields."""
+
+    def change(document: Any) -> None:
+        document |= {"orbit": orbit(), **rest}
+
+    return change
+
+
+_BY_SUN = {"channel": "orbit.sun_px", "node": "a"}
+ORBITS: list[tuple[Edit, str]] = [
+    (edit("orbit", to={"attitude": "nadir"}), "orbit.tle: is missing"),
+    (edit("orbit", to={"tle": TLE}), "orbit.attitude: is missing"),
+    (edit("orbit", to=orbit(tle=TLE[:1])), "orbit.tle[1]: is missing"),
+    (edit("orbit", to=orbit(tle=TLE[::-1])), "orbit.tle[0]: line 1 must have 69 characters and begin with '1 '"),
+    (edit("orbit", to=orbit(tle=[TLE[0], TLE[1][:-1] + "8"])), "orbit.tle[1]: checksum of line 2 is 8, must be 9"),
+    (
+        edit("orbit", to=orbit(tle=[TLE[0], TLE[1].replace("97.70", "9x.70")])),
+        "orbit.tle[1]: inclination (line 2, columns",
+    ),
+    (edit("orbit", to=orbit(tle=[TLE[0], 7])), "orbit.tle[1]: must be text"),
+    (edit("orbit", to=orbit("upside-down")), "orbit.attitude.pointing: must be 'nadir', 'sun' or 'tumbling'"),
+    (edit("orbit", to=orbit(["nadir"])), "orbit.attitude: must be a mapping of fields"),
+    (edit("orbit", to=orbit({})), "orbit.attitude: give one of nadir, sun, tumbling,"),
+    (edit("orbit", to=orbit({"inertial": [1, 1, 0, 0]})), "orbit.attitude.inertial: is no attitude"),
+    (edit("orbit", to=orbit({"inertial": [1, 0, 0]})), "orbit.attitude.inertial[3]: is missing"),
+    (edit("orbit", to=orbit({"spin_axis": [0, 0, 0]})), "orbit.attitude.spin_axis: must not be (0, 0, 0)"),
+    (edit("orbit", to=orbit({"inertial": [1, 0, 0, 0], "frame": "orbit"})), "orbit.attitude: frame belongs to"),
+    (edit("orbit", to=orbit({"pointing": "sun", "about": "x"})), "orbit.attitude: about belongs to spin_axis"),
+    (
+        edit("orbit", to=orbit({"quaternion_channels": ["q0", "q1", "q2", "q3"]})),
+        "orbit.attitude.quaternion_channels: unknown channel 'q0'",
+    ),
+    (
+        edit("orbit", to=orbit({"quaternion_channels": ["T_a", "T_a", "T_a", "T_a"]})),
+        "orbit.attitude.quaternion_channels: channel 'T_a' is temperature, must be auxiliary",
+    ),
+    (edit("orbit", to=orbit(albedo=1.5)), "orbit.albedo: must be less than or equal to 1"),
+    (edit("orbit", to=orbit(earth_infrared_W_per_m2=-1)), "orbit.earth_infrared_W_per_m2: must be greater"),
+    (edit("orbit", to=orbit(height_km=500)), "orbit.height_km: unknown field"),
+    (edit("loads", 0, to=_BY_SUN), "loads[0].channel: unknown channel 'orbit.sun_px'; declare the orbit"),
+    (declare_orbit(loads=[{**_BY_SUN, "channel": "orbit.sun_up"}]), "'orbit.sun_up'; correct its name (known:"),
+    (declare_orbit(loads=[{**_BY_SUN, "channel": "orbit.sun_mean"}]), "loads[0].channel: unknown channel"),
+    (declare_orbit(loads=[{**_BY_SUN, "solar": True}]), "loads[0].solar: 'orbit.sun_px' follows the Sun's distance"),
+    (declare_orbit(loads=[{**_BY_SUN, "table": {"knots": [0, 1]}}]), "loads[0].table: 'orbit.sun_px' is heat already"),
+    (
+        declare_orbit(loads=[{**_BY_SUN, "channel": "orbit.eclipse"}]),
+        "loads[0].table: auxiliary channel 'orbit.eclipse'",
+    ),
+]
+"""Changes that are wrong about an orbit."""
+
 TEXTS: list[tuple[str, str, str]] = [
     ("spec.yaml", "", "the top level must be a mapping"),
     ("spec.yaml", "- a\n- b\n", "the top level must be a mapping"),
@@ -285,7 +347,9 @@ def refuse(argv: Sequence[str], desk: Path, capsys: pytest.CaptureFixture[str], 
     assert sorted(path.name for path in desk.iterdir()) == before
 
 
-@pytest.mark.parametrize(("change", "expected"), SPECIFICATIONS, ids=[case[1] for case in SPECIFICATIONS])
+@pytest.mark.parametrize(
+    ("change", "expected"), SPECIFICATIONS + ORBITS, ids=[case[1] for case in SPECIFICATIONS + ORBITS]
+)
 def test_specification(
     change: Edit, expected: str, desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -308,6 +372,16 @@ def test_telemetry(content: str | bytes, expected: str, desk: Path, capsys: pyte
     (desk / "data.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
     argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
     refuse(argv, desk, capsys, "data.csv", expected)
+
+
+def test_orbit_without_dates(desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    (desk / "spec.yaml").write_text(yaml.safe_dump({**pair, "orbit": orbit()}))
+    rows = "".join(f"{60 * k},20,293,5\n" for k in range(60))
+    (desk / "data.csv").write_text(HEAD.replace("time", "time_s") + rows)
+    for command in ("calibrate --out model.json", "close-loop --out loop"):
+        name, *rest = command.split()
+        argv = [name, "--spec", "spec.yaml", "--telemetry", "data.csv", *rest]
+        refuse(argv, desk, capsys, "data.csv: the orbit needs dates; give a 'time' column in RFC 3339, not 'time_s'")
 
 
 @pytest.mark.parametrize(("line", "expected"), ARGUMENTS, ids=[case[1] for case in ARGUMENTS])

@@ -15,9 +15,6 @@ ASTRONOMICAL_UNIT_M = 149_597_870_700.0
 EARTH_RADIUS_M = 6_378_137.0
 """WGS 84 equatorial radius."""
 
-EARTH_FLATTENING = 1.0 / 298.257223563
-"""WGS 84: the polar radius is shorter by this share of the equatorial one."""
-
 EARTH_GM_M3_PER_S2 = 3.986004418e14
 """WGS 84 geocentric gravitational constant."""
 

@@ -75,7 +75,8 @@ def close_loop(
             progress=progress,
         )
     _save(loop, out)
-    notify([notice for record in (*records, *held_out) for notice in record.notices])
+    of_records = [notice for record in (*records, *held_out) for notice in record.notices]
+    notify(list(dict.fromkeys([*of_records, *loop.report["notices"]])))
     if as_json:
         print_line(to_json(loop.report).rstrip())
     else:

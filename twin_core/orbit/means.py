@@ -18,6 +18,9 @@ PIECE_S = 60.0
 """Longest piece of a step with two Gauss points: over it a low orbit turns by 4 degrees, and the means of what turns
 with it are right to 1e-8; kinks, where a face turns away, cost 1e-5 of an orbit's heat."""
 
+MOST_PIECES = 2000
+"""Pieces of one step at most: what lies in a step of more than a day nobody resolves."""
+
 EDGE_PARTS = 16
 """Parts of a piece in which the Sun sets or rises, two Gauss points each: 2 s, a fraction of a low orbit's penumbra."""
 
@@ -73,7 +76,7 @@ def _windows(step_s: FloatArray) -> Iterator[slice]:
 
 
 def _n_pieces(step_s: FloatArray) -> IntArray:
-    return np.maximum(1, np.ceil(step_s / PIECE_S - 1e-9)).astype(np.int64)
+    return np.clip(np.ceil(step_s / PIECE_S - 1e-9), 1, MOST_PIECES).astype(np.int64)
 
 
 class _Points(NamedTuple):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.constants import EARTH_FLATTENING, EARTH_RADIUS_M
+from twin_core.constants import EARTH_RADIUS_M
 
 SUN_RADIUS_M = 6.957e8
 """IAU 2015 resolution B3, nominal."""
@@ -14,8 +14,9 @@ def apparent_discs(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the angular radii of the Sun's and the Earth's disc and the angle between their centres, (n_times,) in rad.
 
-    The Earth is the ellipsoid of WGS 84: on the side where the Sun passes its limb lies lower by the flattening times
-    the squared sine of the latitude there, to 0.1 km; a sphere would be wrong by 3 s of a polar orbit's eclipse.
+    The Earth is a sphere of its equatorial radius without air. Towards the poles its surface lies up to 21 km lower; light
+    that passes lower than about 20 km is mostly scattered away. In a low orbit, where the ray to the Sun sinks by 3 km
+    a second, each of the two shifts the edge of an eclipse by up to 7 s, against each other.
 
     Parameters
     ----------
@@ -27,14 +28,10 @@ def apparent_discs(
     """
     to_sun = sun * sun_distance_m[:, None] - position_m
     away, radius = _length(to_sun), _length(position_m)
-    along = np.einsum("ti,ti->t", position_m, sun)
-    aside = position_m - along[:, None] * sun
-    north = aside[:, 2] / np.maximum(_length(aside), 1.0)
-    limb_m = EARTH_RADIUS_M * (1.0 - EARTH_FLATTENING * north**2)
     cosine = -np.einsum("ti,ti->t", position_m, to_sun) / (radius * away)
     return (
         np.arcsin(SUN_RADIUS_M / away),
-        np.arcsin(np.minimum(limb_m / radius, 1.0)),
+        np.arcsin(np.minimum(EARTH_RADIUS_M / radius, 1.0)),
         np.arccos(np.clip(cosine, -1.0, 1.0)),
     )
 
@@ -46,16 +43,16 @@ def visible_share(sun_radius: FloatArray, earth_radius: FloatArray, apart: Float
     :func:`apparent_discs` returns them.
     """
     a, b, c = sun_radius, earth_radius, apart
+    # Far beyond the Earth its disc is the smaller one and leaves a ring.
+    share = np.where(c <= np.abs(a - b), np.where(b >= a, 0.0, 1.0 - (b / a) ** 2), 1.0)
     partly = (np.abs(a - b) < c) & (c < a + b)
-    c_safe = np.where(partly, c, a + b)
-    x = (c_safe**2 + a**2 - b**2) / (2.0 * c_safe)
+    a, b, c = a[partly], b[partly], c[partly]
+    x = (c**2 + a**2 - b**2) / (2.0 * c)
     y = np.sqrt(np.maximum(a**2 - x**2, 0.0))
     arc_a = a**2 * np.arccos(np.clip(x / a, -1.0, 1.0))
-    arc_b = b**2 * np.arccos(np.clip((c_safe - x) / b, -1.0, 1.0))
-    covered = (arc_a + arc_b - c_safe * y) / (np.pi * a**2)
-    # Far beyond the Earth its disc is the smaller one and leaves a ring.
-    inside = np.where(b >= a, 0.0, 1.0 - (b / a) ** 2)
-    return np.where(partly, np.clip(1.0 - covered, 0.0, 1.0), np.where(c <= np.abs(a - b), inside, 1.0))
+    arc_b = b**2 * np.arccos(np.clip((c - x) / b, -1.0, 1.0))
+    share[partly] = np.clip(1.0 - (arc_a + arc_b - c * y) / (np.pi * a**2), 0.0, 1.0)
+    return share
 
 
 def _length(vectors: FloatArray) -> FloatArray:

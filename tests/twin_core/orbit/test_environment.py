@@ -37,7 +37,7 @@ def test_faces_of_a_nadir_pointing_cube() -> None:
 
 
 def test_albedo_fades_behind_the_terminator() -> None:
-    """It is less than 3 % of its most above the terminator, still some beyond it, and nothing once the Sun's light is out of view."""
+    """Above the terminator it is less than 6 % of its most, some is left beyond, none once no lit ground is in view."""
     time_s = np.arange(0.0, LOW.period_s, 5.0)
     environment = Environment(LOW, Tumbling())
     sky = environment.sky(EQUINOX_NS, time_s)
