@@ -87,7 +87,7 @@ def test_the_live_filter_follows_through_eclipses(client: TwinClient) -> None:
 
 
 def test_a_forecast_needs_no_plan_of_the_sunlight(client: TwinClient) -> None:
-    """Two orbits ahead: the swings of 20 K are where they will be."""
+    """Two orbits ahead: the swings through the eclipses are where they will be."""
     ahead = np.arange(N_TRAIN, N_TIMES)
     made = client.forecast("cube", ahead.size * STEP_S, step_s=STEP_S)
     mean = np.array(made.values["T"]["mean"])
@@ -101,6 +101,7 @@ def test_the_network_of_the_moment_shows_its_loads(client: TwinClient) -> None:
 
 
 def test_what_the_orbit_gives_cannot_be_sent_or_planned(client: TwinClient) -> None:
-    body = {"time": [EPOCH_NS / 1e9 + 1e6], "values": {"orbit.sun_mean": [3.0]}}
-    refused = client._http.post("/v1/twins/cube/telemetry", json=body)
-    assert refused.status_code == 422 and "orbit.sun_mean" in refused.text
+    columns = {"time": [EPOCH_NS / 1e9 + N_TRAIN * STEP_S], "values": {"orbit.sun_mean": [3.0]}}
+    for path, body in (("telemetry", columns), ("forecasts", {"horizon_s": 600.0, "plan": columns})):
+        refused = client._http.post(f"/v1/twins/cube/{path}", json=body)
+        assert refused.status_code == 422 and "orbit.sun_mean" in refused.text, path

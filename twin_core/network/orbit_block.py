@@ -95,7 +95,7 @@ class AttitudeBlock(Strict):
             return Spinning(self.frame or "inertial", self.spin_axis, self.about or "z")
         if self.inertial is not None:
             return Held("inertial", self.inertial)
-        return Tumbling() if self.pointing == "tumbling" else Held({"nadir": "orbit"}.get(self.pointing or "", "sun"))
+        return Tumbling() if self.pointing == "tumbling" else Held("orbit" if self.pointing == "nadir" else "sun")
 
 
 class OrbitBlock(Strict):

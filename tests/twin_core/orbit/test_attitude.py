@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -55,6 +55,7 @@ def test_a_quaternion_turns_the_body_into_the_frame() -> None:
     np.testing.assert_allclose(axes[:, :, 1], np.broadcast_to([-1.0, 0.0, 0.0], (3, 3)), atol=1e-12)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 10**6))
 def test_sunlight_on_a_box_is_that_on_its_three_lit_faces(seed: int) -> None:
     """Squares add to one, opposite faces are never lit together; front and back of the Earth's view are one vector."""

@@ -74,7 +74,7 @@ def test_a_line_has_the_mean_and_the_first_moment_of_its_step() -> None:
                 assert (last - first) / 12.0 == pytest.approx(moment, abs=1e-5 * scale), name
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     st.floats(250.0, 2000.0),
     st.floats(0.0, 180.0),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin_core._typing import FloatArray
@@ -43,6 +43,7 @@ def test_far_behind_the_earth_a_ring_is_left() -> None:
     assert share == pytest.approx(1.0 - discs**2, rel=1e-3)
 
 
+@settings(deadline=None)
 @given(st.floats(6.6e6, 4.3e7), st.floats(0.0, np.pi / 2.0), st.floats(-0.4, 0.4), st.floats(0.0, 2.0 * np.pi))
 def test_light_is_the_share_of_rays_that_pass_the_earth(
     radius_m: float, angle: float, south: float, turn: float

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
@@ -41,6 +41,7 @@ def test_plate_equals_the_sum_over_directions(distance: float, angle_deg: float)
     assert closed == pytest.approx(integrated_view_factor(distance, np.radians(angle_deg)), abs=2e-5)
 
 
+@settings(deadline=None)
 @given(DISTANCES, COSINES)
 def test_both_sides_of_a_plate_part_what_falls_on_it(distance: float, cosine: float) -> None:
     """Front minus back is the vector of the whole sphere, cos / H^2: the cosine and its negative are one integral."""
@@ -49,6 +50,7 @@ def test_both_sides_of_a_plate_part_what_falls_on_it(distance: float, cosine: fl
     assert 0.0 <= back[0] <= 1.0 and 0.0 <= front[0] <= 1.0
 
 
+@settings(deadline=None)
 @given(DISTANCES)
 def test_tumbling_is_the_mean_over_all_tilts(distance: float) -> None:
     """Every cosine of the tilt is equally likely over the sphere of orientations; kinks are integrated piece by piece."""
@@ -60,6 +62,7 @@ def test_tumbling_is_the_mean_over_all_tilts(distance: float) -> None:
     assert tumbling_view_factor(one(distance))[0] == pytest.approx(0.5 * mean, rel=1e-6)
 
 
+@settings(deadline=None)
 @given(DISTANCES, COSINES)
 def test_spinning_is_the_mean_over_a_turn(distance: float, cosine: float) -> None:
     """The plate's normal goes round the axis: its cosine to the nadir is that of the phase times the sine of the axis."""
@@ -69,6 +72,7 @@ def test_spinning_is_the_mean_over_a_turn(distance: float, cosine: float) -> Non
     assert spinning_view_factor(one(distance), one(cosine))[0] == pytest.approx(mean, rel=2e-3, abs=2e-5)
 
 
+@settings(deadline=None)
 @given(st.floats(-5.0, 5.0), st.floats(0.0, 5.0))
 def test_half_rectified_cosine(level: float, swing: float) -> None:
     angle = (np.arange(20_000) + 0.5) * np.pi / 20_000
@@ -76,6 +80,7 @@ def test_half_rectified_cosine(level: float, swing: float) -> None:
     assert mean_positive(one(level), one(swing))[0] == pytest.approx(mean, abs=1e-6)
 
 
+@settings(deadline=None)
 @given(st.floats(1.02, 7.0), st.booleans())
 def test_all_the_light_that_the_earth_reflects_passes(distance: float, by_cosine: bool) -> None:
     """Over the whole sphere around the Earth the mean illumination is 1/4: a disc catches what a sphere gives back.
