@@ -5,13 +5,12 @@ Faces are named after the axis of the body that leaves them: ``px`` is the face 
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from twin_core._typing import FloatArray
+from twin_core.orbit.quaternions import interpolated, matrices
 from twin_core.orbit.sky import Sky, unit
 from twin_core.orbit.view_factors import (
     illumination,
@@ -95,8 +94,7 @@ class Held:
 
     def axes(self, sky: Sky) -> FloatArray:
         """Return the axes of the body as columns, (n_times, 3, 3)."""
-        turn = Rotation.from_quat(np.roll(self.quaternion, -1)).as_matrix()
-        return FRAMES[self.frame](sky) @ turn
+        return FRAMES[self.frame](sky) @ matrices(np.array(self.quaternion))
 
     def exposures(self, sky: Sky) -> Mapping[str, Exposure]:
         """Return what each face has."""
@@ -126,16 +124,9 @@ class Commanded:
         """All six."""
         return FACES
 
-    @cached_property
-    def _turns(self) -> Slerp:
-        told = np.roll(self.quaternion, -1, axis=1)
-        if self.time_s.size == 1:  # what holds is the same a second later
-            return Slerp(self.time_s[0] + np.array([0.0, 1.0]), Rotation.from_quat(np.repeat(told, 2, axis=0)))
-        return Slerp(self.time_s, Rotation.from_quat(told))
-
     def exposures(self, sky: Sky) -> Mapping[str, Exposure]:
         """Return what each face has."""
-        turns = self._turns(np.clip(sky.time_s, self.time_s[0], self.time_s[-1])).as_matrix()
+        turns = matrices(interpolated(sky.time_s, self.time_s, self.quaternion))
         return _of_axes(sky, FRAMES[self.frame](sky) @ turns)
 
 
