@@ -128,7 +128,10 @@ def measure(data: Path) -> str:
         ["held-out rmse of all sensors, K", f"{rmse_K(errors):.2f}"],
         ["each, K", ", ".join(told)],
         *_told_apart(model),
-        ["seconds of one core for the orbit over 100,000 samples, tumbling", f"{_seconds_for(environment, 100_000):.2f}"],
+        [
+            "seconds of one core for the orbit over 100,000 samples, tumbling",
+            f"{_seconds_for(environment, 100_000):.2f}",
+        ],
     ]
     return markdown_table(["FUNcube-1", "measured"], table)
 
