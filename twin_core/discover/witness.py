@@ -188,7 +188,8 @@ def bear_witness(search: Search) -> Witness:
         said = None if effect is None or np.isnan(effect[:, at]).any() else effect[:, at]
         time_s = view.forcing.stage_time_s[:, 1]
         drivers = {f"temperature of {node}": states[:, at], **view.drivers(search.base.fit.network)}
-        follows = followed(time_s, mean, drivers)
+        others = {name: states[:, i] for i, name in enumerate(search.base.fit.network.nodes) if i != at}
+        follows = followed(time_s, mean, drivers, own_K=states[:, at], others_K=others)
         heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
     return Witness(tuple(heats), tuple(notices))
 

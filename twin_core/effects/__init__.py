@@ -10,6 +10,7 @@ from twin_core.effects.conductance_step import ConductanceStep
 from twin_core.effects.conductance_temperature import ConductanceTemperature
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.emissivity_step import EmissivityStep
+from twin_core.effects.heat_load_step import HeatLoadStep
 from twin_core.effects.hidden_mass import HiddenMass
 from twin_core.effects.input_drift import InputDrift
 from twin_core.effects.input_gain import InputGain
@@ -39,6 +40,7 @@ REGISTRY: dict[str, type[Effect]] = {
         LeakToBoundary,
         NonlinearConvection,
         ConstantHeatLoad,
+        HeatLoadStep,
         PeriodicHeatLoad,
         ChannelHeatLoad,
         ThermostatHeater,

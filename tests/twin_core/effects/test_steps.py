@@ -19,7 +19,7 @@ from tests.helpers import (
 )
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
-from twin_core.effects import REGISTRY, Effect, Survey
+from twin_core.effects import REGISTRY, Effect, Survey, effect_from_json, effect_to_json
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
@@ -91,6 +91,7 @@ def rates(strap: float, leak: float, power_W: float) -> tuple[np.ndarray, np.nda
         (step("conductance_step", {"nodes": ["n1", "n0"]}, 0.2), rates(0.6, 0.8, 40.0)),
         (step("conductance_step", {"nodes": ["n0", "n1"]}, 0.0), rates(0.0, 0.8, 40.0)),
         (step("conductance_step", {"nodes": ["n1", "room"]}, 3.0), rates(3.0, 2.4, 40.0)),
+        (step("heat_load_step", {"node": "n0"}, -15.0), rates(3.0, 0.8, 25.0)),
     ],
     ids=lambda x: x.label if isinstance(x, Effect) else "",
 )
@@ -101,6 +102,23 @@ def test_the_balance_changes_at_the_onset(effect: Effect, after: tuple[np.ndarra
     away = np.abs(record.time_s - ONSET_S) > WIDTH_S  # a ramp and a step differ while it lasts
     np.testing.assert_allclose(found[away], expected[away], atol=2e-3)
     assert np.abs(expected[-1] - states(network_of(declared()), record, expected[0])[-1]).max() > 0.5
+
+
+def test_a_heat_that_ends_leaves_the_balance_as_it_was() -> None:
+    effect = step("heat_load_step", {"node": "n0"}, 12.0)
+    ending = replace(effect, values={**effect.values, "stop": 9000.0})
+    assert [q.name for q in ending.qualities()] == ["Q_W", "time", "stop"]
+    again = effect_from_json(json.loads(json.dumps(effect_to_json(ending))))
+    assert again == ending
+    record, start = heated(), np.array([290.0, 285.0])
+    found = states(network_of(declared(), again), record, start)
+    middle = np.searchsorted(record.time_s, 9000.0)
+    forever = states(network_of(declared(), effect), record, start)
+    np.testing.assert_allclose(found[: middle - 1], forever[: middle - 1], atol=1e-9)
+    expected = linear_states(
+        rates(3.0, 0.8, 40.0)[0], np.tile(rates(3.0, 0.8, 40.0)[1], (51, 1)), found[middle + 1], record.time_s[:51]
+    )
+    np.testing.assert_allclose(found[middle + 1 : middle + 50], expected[:49], atol=2e-3)
 
 
 def test_a_radiator_settles_where_its_new_emissivity_sheds_the_heat() -> None:
@@ -122,16 +140,27 @@ EVERY_STEP = [
     step("conductance_step", {"nodes": ["n0", "n1"]}, 2.0),
     step("conductance_step", {"nodes": ["room", "n1"]}, 0.3),
     step("emissivity_step", {"node": "n0", "sink": "space"}, 1.5),
+    step("heat_load_step", {"node": "n1"}, 12.0),
 ]
 
 
 @pytest.mark.parametrize("effect", EVERY_STEP, ids=lambda e: e.label)
 def test_the_onset_has_an_exact_derivative(effect: Effect) -> None:
     """Steps of 20 s against a ramp of 60 s: the scheme sees every part of it, and the onset may lie anywhere."""
+    assert_exact_derivative(effect, "time", ONSET_S + 7.0)
+
+
+def test_the_end_of_a_heat_has_an_exact_derivative() -> None:
+    effect = step("heat_load_step", {"node": "n0"}, 12.0)
+    assert_exact_derivative(replace(effect, values={**effect.values, "stop": 9000.0}), "stop", 9007.0)
+
+
+def assert_exact_derivative(effect: Effect, instant: str, onset: float) -> None:
+    """``onset`` is such that no end of the ramp meets a stage of the scheme."""
     data = declared(radiators=[{"node": "n0", "emissivity": 0.4, "area_m2": 0.2, "sink": "space"}])
     network, start = network_of(data, effect), np.array([290.0, 285.0])
     forcing = build_forcing(network, heated(), 20.0)
-    name, onset = f"{effect.label}.time", ONSET_S + 7.0  # no end of the ramp meets a stage of the scheme
+    name = f"{effect.label}.{instant}"
     parameters = network.parameters.updated({name: onset})
     column = parameters.free_names.index(name)
 

@@ -1,0 +1,61 @@
+"""An undeclared heat that sets in at an instant, and may end at another: a unit switched on, a new operating mode."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.effects.base import Quality, Where
+from twin_core.effects.onset import OnsetEffect
+from twin_core.network.model import Addition, Layout
+from twin_core.network.terms import Along, Entry, Heat
+from twin_core.parameters.parameter import Parameter
+
+
+@dataclass(frozen=True)
+class SteppedHeat:
+    """q = Q times the share that has set in, less the share that has stopped; values are Q, time and, if it ends, stop."""
+
+    node: int
+    effect: "HeatLoadStep"
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the heat; a ramp as wide as a sampling interval stands for each step."""
+        share, slope = self.effect.ramp(along.time_s, values[1])
+        entries = [Entry(1, self.node, values[0] * slope)]
+        if len(values) > 2:
+            stopped, slope = self.effect.ramp(along.time_s, values[2])
+            share = share - stopped
+            entries.append(Entry(2, self.node, -values[0] * slope))
+        entries.append(Entry(0, self.node, share))
+        return Heat((self.node,), (values[0] * share)[:, None], np.zeros((1, 1, 1)), entries)
+
+
+class HeatLoadStep(OnsetEffect):
+    """q = Q from an instant on; with a value ``stop`` until that instant."""
+
+    name = "heat_load_step"
+    keys = ("node",)
+    equation = "q = Q from time on, to stop if it ends"
+    reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2 (dissipation by operating mode)"
+    words = "receives a heat that nobody declared from an instant on"
+    amplitude = Quality("Q_W", "W", null=0.0)
+
+    def qualities(self) -> tuple[Quality, ...]:
+        """Return heat and onset, and the end where there is one."""
+        amplitude, onset = super().qualities()
+        end = (replace(onset, name="stop"),) if "stop" in self.values else ()
+        return (amplitude, onset, *end)
+
+    def addition(self, layout: Layout) -> Addition:
+        """Return the heat."""
+        term = SteppedHeat(layout.node(self.where["node"]), self, self.parameters())
+        return Addition((term,), dated=self.settings["dated"])
+
+    @classmethod
+    def places(cls, layout: Layout) -> Iterable[Where]:
+        """Yield every node."""
+        yield from ({"node": node} for node in layout.declared_nodes)
