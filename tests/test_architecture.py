@@ -13,7 +13,7 @@ PACKAGES = ("twin_core", "service", "replay")
 
 ROOMS = (
     *("constants", "errors", "_typing", "units", "files", "csv_table"),
-    *("parameters", "telemetry", "orbit"),
+    *("parameters", "telemetry", "orbit", "quality"),
     *("network", "gp", "telemetry_csv", "fem"),
     *("effects", "simulate", "latent_force"),
     "calibrate",

@@ -17,6 +17,29 @@ LEAST_PART = 20
 
 
 @dataclass(frozen=True)
+class Flaw:
+    """Samples of one channel, next to each other, that are no readings.
+
+    Attributes
+    ----------
+    channel
+        Its name.
+    reason
+        Why they are none: ``frozen``, ``rail``, ``sentinel`` or ``spike``.
+    start_s, stop_s
+        The record's own seconds of the first and the last of them.
+    samples
+        How many there are.
+    """
+
+    channel: str
+    reason: str
+    start_s: float
+    stop_s: float
+    samples: int
+
+
+@dataclass(frozen=True)
 class Record:
     """One segment of telemetry.
 
@@ -30,6 +53,10 @@ class Record:
         Unix nanoseconds of ``time_s = 0``; None where the record carries no dates.
     name
         Where it came from, for messages.
+    notices
+        What its reader should know.
+    flaws
+        What was masked; None where nobody has looked yet.
     """
 
     time_s: FloatArray
@@ -37,6 +64,7 @@ class Record:
     epoch_ns: int | None = None
     name: str = "record"
     notices: tuple[str, ...] = field(default=())
+    flaws: tuple[Flaw, ...] | None = None
 
     def __post_init__(self) -> None:
         """Check the axis and the shapes; raise TelemetryError naming the first offender."""
@@ -73,6 +101,7 @@ class Record:
             self.epoch_ns,
             self.name,
             self.notices,
+            self.flaws,
         )
 
     @property

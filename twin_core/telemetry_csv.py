@@ -1,7 +1,7 @@
 """Telemetry in CSV files: a table of channels in their own units <-> a record in SI."""
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,9 @@ from twin_core.errors import TelemetryError
 from twin_core.files import replacing
 from twin_core.network.plausible import LARGEST, implausible
 from twin_core.network.spec import Channel, TwinSpec
-from twin_core.telemetry import Record
-from twin_core.units import from_si, to_si
+from twin_core.quality.sentinels import marked
+from twin_core.telemetry import LEAST_PART, Record
+from twin_core.units import calendar_instant, from_si, to_si
 
 TIME, TIME_S = "time", "time_s"
 _FIRST_YEAR, _LAST_YEAR = 1970, 2199
@@ -23,13 +24,28 @@ _HOW = "write it like 2026-01-03T00:00:00Z"
 
 
 def read_csv(path: Path | str, spec: TwinSpec, *, required: Collection[str] | None = None) -> Record:
+    """Read a telemetry file that holds one segment, as :func:`read_segments` does; TelemetryError if it holds several."""
+    segments = read_segments(path, spec, required=required)
+    if len(segments) > 1:
+        at = segments[1].present(segments[1].time_s[0])
+        raise TelemetryError(
+            f"{path}: its clock jumps back to {at}; sort the rows by time, or write a file for each part"
+        )
+    return segments[0]
+
+
+def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str] | None = None) -> list[Record]:
     """Read a telemetry file.
+
+    Where the clock jumps back a new segment begins. A row that repeats the instant of the row before it is dropped: the
+    first one stays.
 
     Parameters
     ----------
     path
-        CSV with a header row; the first column is ``time`` (RFC 3339) or ``time_s`` (seconds), each other one a
-        channel. An empty cell is a missing sample. Columns that the specification does not declare are ignored.
+        CSV with a header row; the first column is ``time`` (RFC 3339, or with the day of the year) or ``time_s``
+        (seconds), each other one a channel. An empty cell is a missing sample. Columns that the specification does not
+        declare are ignored.
     spec
         Declares the channels and their units.
     required
@@ -37,8 +53,9 @@ def read_csv(path: Path | str, spec: TwinSpec, *, required: Collection[str] | No
 
     Returns
     -------
-    Record
-        In SI; ``time_s`` counts from the first row where the file is dated. Its notices name the ignored columns.
+    list of Record
+        Segments in SI, in the order of the file; ``time_s`` counts from the segment's first row where the file is dated.
+        The notices name the ignored columns and count the repeated instants. Markers of missing samples are still there.
 
     Raises
     ------
@@ -49,15 +66,58 @@ def read_csv(path: Path | str, spec: TwinSpec, *, required: Collection[str] | No
     if table.header[0] not in (TIME, TIME_S):
         raise TelemetryError(f"{path}: row 1: the first column is '{table.header[0]}', must be '{TIME}' or '{TIME_S}'")
     names = present_channels(str(path), table.header[1:], spec, required)
-    if table.header[0] == TIME:
-        time_ns = _instants_ns(table)
-        epoch_ns: int | None = int(time_ns[0])
-        time_s = (time_ns - time_ns[0]) / 1e9
-    else:
-        epoch_ns, time_s = None, _seconds(table)
-    _check_increasing(table, time_s)
+    dated = table.header[0] == TIME
+    clock: IntArray | FloatArray = _instants_ns(table) if dated else _seconds(table)
     values = {name: _in_si(table, name, spec.channels[name], column) for name, column in table.numbers(names).items()}
-    return Record(time_s, values, epoch_ns, str(path), ignored_notice(str(path), table.header[1:], spec))
+    notices = list(ignored_notice(str(path), table.header[1:], spec))
+    kept = _first_of_instants(str(path), clock, values, notices)
+    segments: list[Record] = []
+    for rows in _forward_runs(table, clock, kept, notices):
+        epoch_ns = int(clock[rows[0]]) if dated else None
+        time_s = (clock[rows] - epoch_ns) / 1e9 if epoch_ns is not None else clock[rows].astype(np.float64)
+        columns = {name: column[rows] for name, column in values.items()}
+        segments.append(Record(time_s, columns, epoch_ns, str(path), () if segments else tuple(notices)))
+    return segments
+
+
+def _first_of_instants(
+    name: str, clock: IntArray | FloatArray, values: Mapping[str, FloatArray], notices: list[str]
+) -> IntArray:
+    """Return the rows that do not repeat the instant of the row before, and note how many do."""
+    repeats = np.flatnonzero(np.diff(clock) == 0) + 1
+    if not repeats.size:
+        return np.arange(clock.size)
+    other = np.zeros(repeats.size, dtype=np.bool_)
+    for column in values.values():
+        both = np.isfinite(column[repeats]) | np.isfinite(column[repeats - 1])
+        other |= both & (column[repeats] != column[repeats - 1])
+    same, differing = int((~other).sum()), int(other.sum())
+    if same:
+        notices.append(f"{name}: {same} row(s) repeat the instant and the values of the row before; dropped")
+    if differing:
+        notices.append(
+            f"{name}: {differing} row(s) repeat the instant of the row before with other values; the first stays"
+        )
+    return np.setdiff1d(np.arange(clock.size), repeats)
+
+
+def _forward_runs(table: CsvTable, clock: IntArray | FloatArray, kept: IntArray, notices: list[str]) -> list[IntArray]:
+    """Return the rows of each segment: a new one begins where the clock jumps back.
+
+    Segments of less than ``LEAST_PART`` samples tell nothing and are left out; a file of nothing else is not sorted.
+    """
+    back = np.flatnonzero(np.diff(clock[kept]) < 0) + 1
+    if not back.size:
+        return [kept]
+    runs = np.split(kept, back)
+    long = [run for run in runs if run.size >= LEAST_PART]
+    if not long:
+        table.refuse(int(kept[back[0]]), table.header[0], "is earlier than the row before; sort the rows by time")
+    said = f"{table.name}: the clock jumps back {back.size} time(s), first in row {table.line[kept[back[0]]]}"
+    scraps = sum(run.size for run in runs) - sum(run.size for run in long)
+    left_out = f"; {scraps} row(s) between jumps are left out" if scraps else ""
+    notices.append(f"{said}; a new segment begins at each{left_out}")
+    return long
 
 
 def present_channels(
@@ -116,7 +176,7 @@ def _spell(time_ns: IntArray) -> list[str]:
 
 def _instants_ns(table: CsvTable) -> IntArray:
     """Return unix nanoseconds of the time column, (n_rows,)."""
-    texts = table.texts(TIME)
+    texts = [calendar_instant(text) for text in table.texts(TIME)]
     for row, text in enumerate(texts):
         match = _INSTANT.fullmatch(text)
         if match is None:
@@ -150,22 +210,10 @@ def _seconds(table: CsvTable) -> FloatArray:
     return time_s
 
 
-def _check_increasing(table: CsvTable, time_s: FloatArray) -> None:
-    steps = np.diff(time_s)
-    if (steps <= 0).any():
-        row = int(np.argmax(steps <= 0)) + 1
-        problem = (
-            "repeats the time of the row before; drop one of them"
-            if steps[row - 1] == 0
-            else ("is earlier than the row before; sort the rows by time")
-        )
-        table.refuse(row, table.header[0], problem)
-
-
 def _in_si(table: CsvTable, name: str, channel: Channel, column: FloatArray) -> FloatArray:
     """Return one channel in SI, plausible everywhere."""
     values = to_si(column, channel.unit)
-    fault = implausible(channel, values)
+    fault = implausible(channel, np.where(marked(values, channel.unit), np.nan, values))
     if fault is not None:
         row, problem = fault
         unit = f" {channel.unit}" if channel.unit else ""
@@ -173,4 +221,12 @@ def _in_si(table: CsvTable, name: str, channel: Channel, column: FloatArray) -> 
     return values
 
 
-__all__ = ["ignored_notice", "implausible", "present_channels", "read_csv", "write_columns", "write_csv"]
+__all__ = [
+    "ignored_notice",
+    "implausible",
+    "present_channels",
+    "read_csv",
+    "read_segments",
+    "write_columns",
+    "write_csv",
+]

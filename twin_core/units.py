@@ -1,6 +1,8 @@
 """The only place where a number changes its unit: SI inside, the channel's own unit at the edges."""
 
-from datetime import UTC, datetime, timedelta
+import re
+from datetime import UTC, date, datetime, timedelta
+from functools import lru_cache
 
 import numpy as np
 
@@ -14,6 +16,9 @@ J2000_NS = 946_728_000_000_000_000
 """Unix nanoseconds of J2000.0, 2000-01-01 12:00 (Julian day 2451545.0)."""
 
 
+_DAY_OF_YEAR = re.compile(r"(\d{4})[-:](\d{3})[Tt: ](\d\d:\d\d:\d\d(?:\.\d{1,9})?)([Zz]|[+-]\d\d:\d\d)?", re.ASCII)
+
+
 def to_si(values: FloatArray, unit: str | None) -> FloatArray:
     """Return ``values`` in SI: degC becomes K, every other unit stays as it is."""
     return values + ZERO_CELSIUS_K if unit == "degC" else values
@@ -22,6 +27,29 @@ def to_si(values: FloatArray, unit: str | None) -> FloatArray:
 def from_si(values: FloatArray, unit: str | None) -> FloatArray:
     """Return SI ``values`` in the channel's ``unit``."""
     return values - ZERO_CELSIUS_K if unit == "degC" else values
+
+
+def calendar_instant(text: str) -> str:
+    """Return a day-of-year time (``2026-121T06:00:00Z``, ``2026:121:06:00:00``) as RFC 3339; any other text as it is.
+
+    Ground systems write day-of-year times in UTC, with or without saying so. A day that the year lacks stays as it is.
+    """
+    match = _DAY_OF_YEAR.fullmatch(text)
+    if match is None:
+        return text
+    day = _calendar_day(int(match[1]), int(match[2]))
+    return text if day is None else f"{day}T{match[3]}{match[4] or 'Z'}"
+
+
+@lru_cache(maxsize=1024)
+def _calendar_day(year: int, day_of_year: int) -> str | None:
+    if year < 1:
+        return None
+    try:
+        day = date(year, 1, 1) + timedelta(days=day_of_year - 1)
+    except OverflowError:
+        return None
+    return day.isoformat() if day.year == year else None
 
 
 def parse_instant_ns(text: str) -> int:
@@ -33,7 +61,7 @@ def parse_instant_ns(text: str) -> int:
         If the text is not an instant or names no UTC offset.
     """
     try:
-        instant = datetime.fromisoformat(text.strip())
+        instant = datetime.fromisoformat(calendar_instant(text.strip()))
     except ValueError as error:
         raise TelemetryError(f"'{text}' is not an RFC 3339 instant; write it like 2026-01-03T00:00:00Z") from error
     if instant.tzinfo is None:

@@ -24,9 +24,12 @@ from replay.cli.command import FILE, Command
 )
 @click.option("--method", default="second-order", show_default=True, help="How to fit; docs/cli.md lists the methods.")
 @click.option("--loss", default="squared", show_default=True, help="squared, or huber for readings with outliers.")
+@click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
-def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, loss: str, out: Path, as_json: bool) -> None:
+def calibrate(
+    spec_file: Path, telemetry: tuple[Path, ...], method: str, loss: str, no_masking: bool, out: Path, as_json: bool
+) -> None:
     """Calibrate the declared network against telemetry, with the uncertainty of every parameter."""
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.recordings import check_suffix, load_records
@@ -36,7 +39,7 @@ def calibrate(spec_file: Path, telemetry: tuple[Path, ...], method: str, loss: s
 
     check_suffix(out, (".json",))
     spec = load_spec(spec_file)
-    records = load_records(telemetry, spec)
+    records = load_records(telemetry, spec, masking=not no_masking)
     with progress_bar("calibrating") as progress:
         model = fit(spec, records, method=method, loss=loss, progress=progress)
     write_text(out, to_json(model.to_json()))

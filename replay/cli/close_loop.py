@@ -38,6 +38,7 @@ VERDICTS = {
 )
 @click.option("--burn-in", type=float, help="First seconds of each hold-out file that tell its initial state.")
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
+@click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def close_loop(
@@ -47,6 +48,7 @@ def close_loop(
     holdout_telemetry: tuple[Path, ...],
     burn_in: float | None,
     false_alarm_rate: float,
+    no_masking: bool,
     out: Path,
     as_json: bool,
 ) -> None:
@@ -61,8 +63,8 @@ def close_loop(
 
     _check(holdout, holdout_telemetry, burn_in, false_alarm_rate, out)
     spec = load_spec(spec_file)
-    records = load_records(telemetry, spec)
-    held_out = load_records(holdout_telemetry, spec)
+    records = load_records(telemetry, spec, masking=not no_masking)
+    held_out = load_records(holdout_telemetry, spec, masking=not no_masking)
     check_apart(records, held_out)
     with progress_bar("closing the loop") as progress:
         loop = run(

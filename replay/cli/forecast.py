@@ -27,6 +27,7 @@ _OUT = (".csv", ".json")
 @click.option("--horizon", required=True, type=float, help="Seconds to look ahead.")
 @click.option("--step", type=float, help="Seconds between forecasts.  [default: as the telemetry is sampled]")
 @click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP; inputs without a plan hold their last value.")
+@click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Forecast to write, .csv or .json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the forecast as JSON.")
 def forecast(
@@ -35,13 +36,14 @@ def forecast(
     horizon: float,
     step: float | None,
     plan: Path | None,
+    no_masking: bool,
     out: Path,
     as_json: bool,
 ) -> None:
     """Forecast temperatures from the end of a record, with mean and quantiles in each channel's unit."""
     from replay.cli.console import notify, print_line, to_json
     from replay.cli.models import load_model
-    from replay.cli.recordings import check_suffix, load_record
+    from replay.cli.recordings import check_suffix, load_segments
     from twin_core.errors import TelemetryError
     from twin_core.forecast import forecast as look_ahead
 
@@ -49,7 +51,7 @@ def forecast(
     if len(telemetry) > 1:
         raise TelemetryError(f"{telemetry[1]}: a forecast starts at the end of one file; name one")
     model = load_model(model_file)
-    record = load_record(telemetry[0], model.spec)
+    record = load_segments(telemetry[0], model.spec, masking=not no_masking)[-1]
     if step is None and record.time_s.size < 2:
         raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
     planned = _load_plan(plan, record, model, horizon) if plan else None

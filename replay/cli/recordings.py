@@ -10,9 +10,19 @@ from replay.mapping import apply_mapping, map_topics
 from replay.mcap_io import read_mcap, write_mcap
 from replay.recording import Recording
 from twin_core.errors import TelemetryError
+from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
+from twin_core.quality import unmasked
+from twin_core.quality.sentinels import marked
 from twin_core.telemetry import Record
-from twin_core.telemetry_csv import ignored_notice, implausible, present_channels, read_csv, write_columns
+from twin_core.telemetry_csv import (
+    ignored_notice,
+    implausible,
+    present_channels,
+    read_csv,
+    read_segments,
+    write_columns,
+)
 from twin_core.units import format_instant, from_si, to_si
 
 DATED = "dated"
@@ -22,7 +32,15 @@ _TEMPERATURE_UNITS = ("K", "degC")
 
 
 def load_record(path: Path, spec: TwinSpec, *, required: Collection[str] | None = None) -> Record:
-    """Read one telemetry file, CSV or MCAP.
+    """Read one telemetry file that holds one segment, as it is; see :func:`load_segments`."""
+    check_suffix(path)
+    if path.suffix == ".csv":
+        return read_csv(path, spec, required=required)
+    return _from_recording(path, read_mcap(path), spec, required)
+
+
+def load_segments(path: Path, spec: TwinSpec, *, masking: bool = True) -> list[Record]:
+    """Read one telemetry file, CSV or MCAP, as segments: a new one begins where the clock jumps back.
 
     Parameters
     ----------
@@ -30,8 +48,8 @@ def load_record(path: Path, spec: TwinSpec, *, required: Collection[str] | None 
         A file ending in .csv or .mcap.
     spec
         Declares channels and units; the topics of an MCAP file are matched by name or by their last part.
-    required
-        Channels that the file must have; by default every channel that the twin uses.
+    masking
+        Leave out samples that cannot be readings.
 
     Raises
     ------
@@ -39,12 +57,24 @@ def load_record(path: Path, spec: TwinSpec, *, required: Collection[str] | None 
         With one line naming the file and what is wrong.
     """
     check_suffix(path)
-    if path.suffix == ".csv":
-        return read_csv(path, spec, required=required)
-    return _from_recording(path, read_mcap(path), spec, required)
+    segments = read_segments(path, spec) if path.suffix == ".csv" else [load_record(path, spec)]
+    if masking:
+        return [screened(spec, segment) for segment in segments]
+    for segment in segments:
+        _check_plausible(spec, segment)
+    return [unmasked(segment) for segment in segments]
 
 
-def load_records(paths: Sequence[Path], spec: TwinSpec) -> list[Record]:
+def _check_plausible(spec: TwinSpec, record: Record) -> None:
+    """Refuse markers of missing samples that nobody is to mask."""
+    for channel, column in record.values.items():
+        fault = implausible(spec.channels[channel], column)
+        if fault is not None:
+            at = record.present(record.time_s[fault[0]])
+            raise TelemetryError(f"{record.name}: sample at {at}: channel '{channel}' {fault[1]}")
+
+
+def load_records(paths: Sequence[Path], spec: TwinSpec, *, masking: bool = True) -> list[Record]:
     """Read several files as segments of one record, in the order given.
 
     Raises
@@ -55,7 +85,7 @@ def load_records(paths: Sequence[Path], spec: TwinSpec) -> list[Record]:
     for position, path in enumerate(paths):
         if path.resolve() in [earlier.resolve() for earlier in paths[:position]]:
             raise TelemetryError(f"{path}: is named twice; each segment counts once")
-    records = [load_record(path, spec) for path in paths]
+    records = [segment for path in paths for segment in load_segments(path, spec, masking=masking)]
     for record in records:
         if (record.epoch_ns is None) != (records[0].epoch_ns is None):
             raise TelemetryError(f"{record.name}: {_form(record)}, {records[0].name} {_form(records[0])}; use one form")
@@ -165,7 +195,8 @@ def _from_recording(path: Path, recording: Recording, spec: TwinSpec, required: 
     time_s = (named.time_ns - (epoch_ns or 0)) / 1e9
     values = {channel: to_si(column, spec.channels[channel].unit) for channel, column in named.columns.items()}
     for channel, column in values.items():
-        fault = implausible(spec.channels[channel], column)
+        readings = np.where(marked(column, spec.channels[channel].unit), np.nan, column)
+        fault = implausible(spec.channels[channel], readings)
         if fault is not None:
             at = format_instant(int(named.time_ns[fault[0]])) if dated else f"{time_s[fault[0]]:g} s"
             raise TelemetryError(f"{name}: sample at {at}: channel '{channel}' {fault[1]}")

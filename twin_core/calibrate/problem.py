@@ -9,7 +9,8 @@ from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.errors import TelemetryError
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
-from twin_core.network.spec import Interval, TwinSpec
+from twin_core.network.screened import excluded
+from twin_core.network.spec import TwinSpec
 from twin_core.parameters.transforms import is_logarithmic
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.response import sensitivities
@@ -47,17 +48,6 @@ class Segment:
     def valid(self) -> BoolArray:
         """Which samples take part, (n_samples, n_sensors)."""
         return np.isfinite(self.measured_K)
-
-
-def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
-    """Return which samples lie in an excluded interval, (n_times,)."""
-    mask = np.zeros(record.time_s.size, dtype=np.bool_)
-    for interval in intervals:
-        if isinstance(interval.start, str) != (record.epoch_ns is not None):
-            continue
-        start, stop = record.locate_s(interval.start), record.locate_s(interval.stop)
-        mask |= (record.time_s >= start) & (record.time_s < stop)
-    return mask
 
 
 def measured_temperatures(spec: TwinSpec, record: Record) -> FloatArray:

@@ -14,7 +14,6 @@ from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
-from twin_core.calibrate.outliers import without_outliers
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener
 from twin_core.calibrate.result import CalibratedModel
@@ -23,6 +22,7 @@ from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.model import Network, build_network
+from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.rollout import rollout
@@ -97,7 +97,7 @@ def prepare(
     TelemetryError
         If telemetry lacks a channel that the model needs, or has too few samples.
     """
-    records = without_outliers(spec, records)
+    records = [screened(spec, record) for record in records]
     noise = sensor_noise_K(spec, list(records))
     network = build_network(spec, effects, table_knots=table_levels(spec, records))
     step = 1.5 * sampling_step_s(records)

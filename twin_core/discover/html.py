@@ -46,6 +46,7 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         sensors=_sensors(report),
         evidence=_evidence(report),
         picture=draw_network(plots.get("network") or {}),
+        quality_strip=plots.get("quality_strip") or "",
         criteria=plots.get("criteria") or report.get("criteria") or {},
         data=_for_script(_chart_data(plots)),
         **{name: _asset(name) for name in ("style", "script", "uplot_style", "uplot_script")},

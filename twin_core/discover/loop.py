@@ -20,7 +20,9 @@ from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
 from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
+from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
+from twin_core.quality import quality_json, quality_strip
 from twin_core.telemetry import Record, cut_at_gaps
 
 
@@ -75,6 +77,8 @@ def close_loop(
     if not 0.0 < false_alarm_rate < 1.0:
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
     begun = time.perf_counter()
+    records = [screened(spec, record) for record in records]
+    holdout_records = [screened(spec, record) for record in holdout_records or ()]
     train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
     fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
@@ -88,6 +92,8 @@ def close_loop(
     witness = bear_witness(found)
     report |= told_by(witness, report)
     plots = build_plots(found, before, after, held, predictions, report, witness)
+    report["quality"] = quality_json([*records, *holdout_records])
+    plots["quality_strip"] = quality_strip([*records, *holdout_records])
     report["elapsed_s"] = time.perf_counter() - begun
     progress(1.0, "done")
     return ClosedLoop(report, after, before, plots)

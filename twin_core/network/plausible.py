@@ -5,9 +5,8 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.network.spec import Channel
+from twin_core.quality.sentinels import HOTTEST_K
 
-HOTTEST_K = 5000.0
-"""Beyond it a temperature is a wrong unit or a marker such as 9999; the specification refuses such boundaries too."""
 LARGEST = 1e12
 """Beyond it any value is a marker for a missing sample, not a measurement."""
 

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from tests.helpers import record_of
-from twin_core.calibrate.noise import FALLBACK_STD_K, difference_noise_K, quantum_K, sensor_noise_K
+from twin_core.calibrate.noise import FALLBACK_STD_K, difference_noise_K, sensor_noise_K
 from twin_core.network.spec_io import load_spec
+from twin_core.quality.quantisation import quantum
 
 RNG_SIZE = 4000
 
@@ -35,9 +36,9 @@ def test_too_few_samples_tell_nothing(column: np.ndarray) -> None:
 
 def test_a_quantised_series_shows_its_step() -> None:
     signal = 290.0 + 3.0 * np.sin(np.arange(800) / 60.0)
-    assert quantum_K(np.round(signal / 0.25) * 0.25) == pytest.approx(0.25)
-    assert quantum_K(signal + noise(0.1, n=800)) == 0.0
-    assert quantum_K(np.full(50, 290.0)) == 0.0
+    assert quantum(np.round(signal / 0.25) * 0.25) == pytest.approx(0.25)
+    assert quantum(signal + noise(0.1, n=800)) == 0.0
+    assert quantum(np.full(50, 290.0)) == 0.0
 
 
 SPEC = load_spec(
@@ -53,14 +54,14 @@ SPEC = load_spec(
 )
 
 
-def test_a_declared_noise_is_believed_down_to_the_quantum() -> None:
+def test_quantisation_adds_its_variance_to_a_declared_noise() -> None:
     signal = 290.0 + 3.0 * np.sin(np.arange(800) / 60.0)
     coarse = np.round(signal / 0.5) * 0.5
     record = record_of(np.arange(800.0), A=signal + noise(0.3, n=800), B=signal + noise(0.3, 1, 800), C=coarse)
     found = sensor_noise_K(SPEC, [record])
     assert found[0] == pytest.approx(0.3, rel=0.1)
     assert found[1] == 0.05
-    assert found[2] == pytest.approx(0.5 / np.sqrt(12.0))
+    assert found[2] == pytest.approx(np.sqrt(0.01**2 + 0.5**2 / 12.0))
 
 
 def test_a_sensor_that_tells_nothing_gets_a_usual_noise() -> None:

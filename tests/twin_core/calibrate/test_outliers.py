@@ -8,9 +8,9 @@ import pytest
 from tests.helpers import central_difference
 from tests.twin_core.calibrate.test_calibrate import STEP_S, TRUTH, declared, scores, telemetry
 from twin_core.calibrate import calibrate
-from twin_core.calibrate.outliers import gross_outliers, without_outliers
 from twin_core.calibrate.second_order import prepare
 from twin_core.errors import ModelError
+from twin_core.network.screened import screened
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -38,31 +38,12 @@ def test_a_dropout_changes_nothing_and_is_said(at: list[int], value: float, coun
     assert left_out.summary["notices"] == []
 
 
-def test_healthy_readings_are_kept() -> None:
-    """Noise, switched heaters, a thermostat's saw, a quantised rest, a step that stays, a gap with a jump."""
-    rng = np.random.default_rng(0)
-    saw = 290.0 + 8.0 * np.abs((np.arange(400) / 7.0) % 2.0 - 1.0)
-    rest = np.round(rng.normal(290.0, 0.03, 400), 1)
-    step = np.where(np.arange(400) < 200, 280.0, 320.0) + rng.normal(0.0, 0.05, 400)
-    gap = np.where((np.arange(400) > 100) & (np.arange(400) < 150), np.nan, step)
-    for column in (saw, rest, step, gap, rng.normal(290.0, 0.1, 400), telemetry(400).values["T_a"]):
-        assert not gross_outliers(column, 0.1).any()
-
-
-@pytest.mark.parametrize("lasting", [2, 3, 4, 60])
-def test_a_record_that_begins_or_ends_in_a_fast_transient_is_kept(lasting: int) -> None:
-    """A closed form: 320 K, then an exponential decay of which a few readings are seen; and the same backwards in time."""
-    since = np.maximum(np.arange(60 + lasting) - 59.0, 0.0)
-    column = 290.0 + 30.0 * np.exp(-since / 10.0) + np.random.default_rng(0).normal(0.0, 0.01, since.size)
-    for healthy in (column, column[::-1]):
-        assert not gross_outliers(healthy, 0.01).any()
-
-
 def test_excluded_readings_are_not_talked_about() -> None:
     data = declared() | {"exclude": [{"start": 9000.0, "stop": 13500.0, "reason": "sensor test"}]}
     record = spoilt(telemetry(), [110, 120], 0.0)
-    (screened,) = without_outliers(load_spec(data), [record])
-    assert screened is record
+    looked_at = screened(load_spec(data), record)
+    assert looked_at.notices == () and looked_at.flaws == ()
+    np.testing.assert_array_equal(looked_at.values["T_a"], record.values["T_a"])
 
 
 def test_hubers_loss_bears_many_small_outliers() -> None:

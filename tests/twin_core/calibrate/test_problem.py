@@ -7,10 +7,11 @@ import pytest
 
 from tests.helpers import active_effect, central_difference, every_term_network
 from twin_core.calibrate.optimise import minimise
-from twin_core.calibrate.problem import Problem, build_problem, excluded
+from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.effects import REGISTRY
 from twin_core.effects.sensor_drift import SensorDrift
 from twin_core.errors import TelemetryError
+from twin_core.network.screened import excluded
 from twin_core.network.spec import Interval
 from twin_core.telemetry import Record
 

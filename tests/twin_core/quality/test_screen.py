@@ -1,0 +1,174 @@
+"""Planted faults in synthetic telemetry: found where they are, and nowhere else."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from twin_core.quality import masked, quality_json, quality_strip, screen, unmasked
+from twin_core.telemetry import Record
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+UNITS = {"T_a": "K", "T_b": "degC", "T_c": "K", "Q": "W"}
+
+
+def healthy(seed: int, n_times: int = 1200, step_K: float = 0.1, noise_K: float = 0.1) -> dict[str, np.ndarray]:
+    """Return three temperatures that drift and swing, with noise, in steps; and a heater that is switched."""
+    rng = np.random.default_rng(seed)
+    at = np.arange(n_times)
+    columns = {}
+    for k, name in enumerate(("T_a", "T_b", "T_c")):
+        truth = 290.0 + 6.0 * np.sin(2.0 * np.pi * at / (90.0 + 25.0 * k) + k) + 2.0 * np.sin(at / 400.0)
+        columns[name] = np.round((truth + rng.normal(0.0, noise_K, n_times)) / step_K) * step_K
+    columns["Q"] = np.where(at // 60 % 2 == 0, 20.0, 0.0)
+    return columns
+
+
+def found(columns: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    time_s = 60.0 * np.arange(columns["Q"].size)
+    return {name: dict(reasons) for name, reasons in screen(time_s, columns, UNITS).masks.items()}
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    step_K=st.sampled_from([1e-3, 0.1, 0.5, 1.0]),
+    noise_K=st.sampled_from([0.0, 0.02, 0.3]),
+)
+def test_healthy_telemetry_loses_nothing(seed: int, step_K: float, noise_K: float) -> None:
+    assert found(healthy(seed, step_K=step_K, noise_K=noise_K)) == {}
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(12, 200))
+def test_frozen_rows_are_found_in_every_channel(seed: int, begin: int, lasting: int) -> None:
+    columns = healthy(seed)
+    for column in columns.values():
+        column[begin + 1 : begin + 1 + lasting] = column[begin]
+    masks = found(columns)
+    for name in ("T_a", "T_b", "T_c"):
+        # The first reading after the freeze may repeat by chance.
+        assert lasting <= masks[name]["frozen"].sum() <= lasting + 1
+        assert masks[name]["frozen"][begin + 1 : begin + 1 + lasting].all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(25, 200))
+def test_one_frozen_channel_is_found_alone(seed: int, begin: int, lasting: int) -> None:
+    columns = healthy(seed)
+    columns["T_b"][begin + 1 : begin + 1 + lasting] = columns["T_b"][begin]
+    masks = found(columns)
+    assert set(masks) == {"T_b"}
+    assert masks["T_b"]["frozen"][begin + 1 : begin + 1 + lasting].all()
+    assert masks["T_b"]["frozen"].sum() <= lasting + 3
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    period=st.floats(20.0, 5000.0),
+    phase=st.floats(0.0, 6.28),
+    step_K=st.floats(1e-3, 2.0),
+    swing_K=st.floats(0.5, 30.0),
+)
+def test_the_turning_points_of_a_quantised_swing_are_no_freeze(
+    period: float, phase: float, step_K: float, swing_K: float
+) -> None:
+    """Without any noise: a sine stays in its topmost step for 2 sqrt(2 step / curvature), far longer than elsewhere."""
+    truth = 290.0 + swing_K * np.sin(2.0 * np.pi * np.arange(3000) / period + phase)
+    assert screen(np.arange(3000.0), {"T_a": np.round(truth / step_K) * step_K}, {"T_a": "K"}).masks == {}
+
+
+@pytest.mark.parametrize(
+    ("channel", "own", "at"),
+    [
+        ("T_a", 0.0, [500]),
+        ("T_a", 0.0, list(range(300, 400))),
+        ("T_a", -999.0, [5, 700]),
+        ("T_b", -999.0, [3, 4, 5]),
+        ("T_b", 9999.0, [0, 1]),
+        ("T_b", 85.0, [0, 77]),
+        ("T_b", -127.0, list(range(600, 680))),
+        ("Q", -9999.0, [40]),
+        ("T_b", 0.0, []),
+        ("Q", 0.0, []),
+    ],
+)
+def test_numbers_that_mean_missing(channel: str, own: float, at: list[int]) -> None:
+    columns = healthy(3)
+    columns[channel][at] = own + (273.15 if UNITS[channel] == "degC" else 0.0)
+    masks = found(columns)
+    if not at:
+        assert masks == {}
+        return
+    assert set(masks) == {channel} and set(masks[channel]) == {"sentinel"}
+    np.testing.assert_array_equal(np.flatnonzero(masks[channel]["sentinel"]), at)
+
+
+def test_a_zero_that_is_a_temperature_stays() -> None:
+    """Through the freezing point, and along it."""
+    columns = {"T_b": np.round(np.random.default_rng(0).normal(0.0, 0.4, 800), 1) + 273.15}
+    assert screen(np.arange(800.0), columns, UNITS).masks == {}
+
+
+def test_a_rail_is_told_from_a_freeze() -> None:
+    rng = np.random.default_rng(1)
+    truth = 290.0 + 30.0 * np.sin(2.0 * np.pi * np.arange(2000) / 400.0) + rng.normal(0.0, 0.3, 2000)
+    clipped = np.minimum(np.round(truth, 1), 310.0)
+    masks = screen(np.arange(2000.0), {"T_a": clipped}, {"T_a": "K"}).masks
+    assert set(masks["T_a"]) == {"rail"}
+    assert masks["T_a"]["rail"].sum() > 0.8 * (truth > 310.5).sum()
+    assert (clipped[masks["T_a"]["rail"]] == 310.0).all()
+
+
+def test_a_masked_record_says_so_and_is_left_alone_afterwards() -> None:
+    columns = healthy(5)
+    columns["T_a"][[300, 301, 600]] = 0.0
+    record = Record(60.0 * np.arange(1200), columns)
+    clean = masked(record, UNITS)
+    assert np.isnan(clean.values["T_a"][[300, 301, 600]]).all() and np.isnan(clean.values["T_a"]).sum() == 3
+    (notice,) = clean.notices
+    assert "3 reading(s) of 'T_a'" in notice and "first at 18000" in notice
+    assert quality_json([clean]) == [{"channel": "T_a", "reason": "sentinel", "samples": 3, "spans": 2}]
+    assert masked(clean, UNITS) is clean
+    assert quality_strip([clean]).count("<title>") == 2
+    raw = unmasked(record)
+    assert masked(raw, UNITS) is raw and quality_json([raw]) == [] and quality_strip([raw]) == ""
+
+
+def test_a_channel_is_named_in_the_strip_as_text() -> None:
+    record = Record(np.arange(40.0), {"<T>": np.where(np.arange(40) == 20, 0.0, 290.0 + 0.01 * np.arange(40) ** 1.5)})
+    strip = quality_strip([masked(record, {"<T>": "K"})])
+    assert "&lt;T&gt;" in strip and "<T>" not in strip
+
+
+def _measured(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, str | None]]:
+    frame = pd.read_csv(path)
+    clock = frame.iloc[:, 0]
+    if frame.columns[0] == "time":
+        clock = (pd.to_datetime(clock) - pd.to_datetime(clock[0])).dt.total_seconds()
+    keep = np.concatenate([[True], np.diff(clock.to_numpy()) > 0])
+    names = list(frame.columns[1:])
+    units: dict[str, str | None] = {name: "degC" if name.endswith("degC") else None for name in names}
+    columns = {n: frame[n].to_numpy(dtype=float)[keep] + (273.15 if units[n] else 0.0) for n in names}
+    return clock.to_numpy(dtype=float)[keep], columns, units
+
+
+MEASURED = sorted(DATA.glob("*/*.csv"))
+
+
+@pytest.mark.skipif(not MEASURED, reason="the measured sets are not beside the repository")
+def test_frozen_rows_of_the_measured_sets() -> None:
+    """FUNcube-1 holds 227 rows for its ground station; one home's thermostat held 18.88 degC for 2.5 hours."""
+    frozen = {}
+    for path in MEASURED:
+        if "flight_model" in path.name:
+            continue
+        for channel, reasons in screen(*_measured(path)).masks.items():
+            if "frozen" in reasons or "rail" in reasons:
+                frozen[path.stem, channel] = sum(int(mask.sum()) for r, mask in reasons.items() if r != "spike")
+    funcube = {key: count for key, count in frozen.items() if key[0].startswith("whole_orbit")}
+    assert len(funcube) == 14 and all(abs(count - 227) <= 2 for count in funcube.values())
+    assert {key: count for key, count in frozen.items() if key not in funcube} == {("home_3", "T_indoor_degC"): 10}

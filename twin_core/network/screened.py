@@ -1,0 +1,30 @@
+"""Telemetry of a declared network, without samples that cannot be readings."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from twin_core._typing import BoolArray
+from twin_core.network.spec import Interval, TwinSpec
+from twin_core.quality import masked
+from twin_core.telemetry import Record
+
+
+def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
+    """Return which samples lie in an excluded interval, (n_times,)."""
+    mask = np.zeros(record.time_s.size, dtype=np.bool_)
+    for interval in intervals:
+        if isinstance(interval.start, str) != (record.epoch_ns is not None):
+            continue
+        start, stop = record.locate_s(interval.start), record.locate_s(interval.stop)
+        mask |= (record.time_s >= start) & (record.time_s < stop)
+    return mask
+
+
+def screened(spec: TwinSpec, record: Record) -> Record:
+    """Return a record with what cannot be readings missing, and notices that say so; excluded samples stay as they are.
+
+    Channels of the orbit are computed and need no screening; a record that was looked at before is returned as it is.
+    """
+    units = {name: channel.unit for name, channel in spec.channels.items()}
+    return masked(record, units, excluded(record, spec.exclude))

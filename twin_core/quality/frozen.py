@@ -1,0 +1,106 @@
+"""Frozen readings: a value that is repeated for longer than quantisation and rate of change explain.
+
+A reading stays the same where the truth stays within one quantisation step. How probable that is from one sample to the
+next is told by the readings just before and just after: by how far they move beyond what quantisation alone can show, and
+by how often they repeat themselves. A run of n repeats has the n-th power of that probability. The quieter side counts, so
+that a rest that something ends, or that something led to, is no freeze. Near a turning point of a smooth signal, a run of n
+repeats has neighbours that move by less than one step per sample, so no turning point is taken for a freeze.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import erf
+
+from twin_core._typing import BoolArray, FloatArray, IntArray
+from twin_core.quality.policy import FALSE_ALARM_RATE, LEAST_READINGS
+from twin_core.quality.quantisation import resolution
+from twin_core.quality.runs import runs_of
+
+_LEAST_WINDOW, _LARGEST_WINDOW = 8, 64
+_COARSE = 3.0
+
+
+def frozen_rows(columns: Sequence[FloatArray]) -> BoolArray:
+    """Return the rows that repeat all readings of the row before, in runs that chance does not explain, (n_times,).
+
+    Parameters
+    ----------
+    columns : n_channels of (n_times,)
+        Readings, NaN where missing; a channel without readings in a row has no say there.
+    """
+    n_times = columns[0].size if columns else 0
+    found = np.zeros(n_times, dtype=np.bool_)
+    moving = [column for column in columns if resolution(column) > 0.0]
+    if n_times < LEAST_READINGS or len(moving) < 2:
+        return found
+    same, any_read = np.ones(n_times - 1, dtype=np.bool_), np.zeros(n_times - 1, dtype=np.bool_)
+    for column in columns:
+        absent = np.isnan(column[1:]) & np.isnan(column[:-1])
+        same &= (column[1:] == column[:-1]) | absent
+        any_read |= ~absent
+    same &= any_read
+    first, stop = runs_of(same)
+    stay = np.maximum(same.mean(), np.prod([_stay(column, first, stop) for column in moving], axis=0))
+    _mark(found, first, stop, _unlikely(stop - first, stay, n_times))
+    return found
+
+
+def frozen_channel(column: FloatArray) -> BoolArray:
+    """Return the readings of one channel that are frozen repeats of an earlier one, (n_times,).
+
+    Parameters
+    ----------
+    column : (n_times,)
+        Readings, NaN where missing.
+    """
+    found = np.zeros(column.size, dtype=np.bool_)
+    at = np.flatnonzero(np.isfinite(column))
+    values = column[at]
+    if at.size < LEAST_READINGS or resolution(values) == 0.0:
+        return found
+    same = values[1:] == values[:-1]
+    first, stop = runs_of(same)
+    stay = np.maximum(same.mean(), _stay(values, first, stop))
+    of_present = np.zeros(at.size, dtype=np.bool_)
+    _mark(of_present, first, stop, _unlikely(stop - first, stay, at.size))
+    found[at[of_present]] = True
+    return found
+
+
+def _unlikely(repeats: IntArray, stay: FloatArray, n_times: int) -> BoolArray:
+    """Return which runs are longer than chance allows anywhere in the record."""
+    with np.errstate(divide="ignore"):
+        log_probability = repeats * np.log(stay) + np.log(n_times)
+    unlikely: BoolArray = log_probability < np.log(FALSE_ALARM_RATE)
+    return unlikely
+
+
+def _mark(found: BoolArray, first: IntArray, stop: IntArray, unlikely: BoolArray) -> None:
+    for begin, end in zip(first[unlikely].tolist(), stop[unlikely].tolist(), strict=True):
+        found[begin + 1 : end + 1] = True
+
+
+def _stay(column: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
+    """Return how probable it is, beside each run, that a reading is that of the sample before, (n_runs,)."""
+    step = resolution(column)
+    changes = np.nan_to_num(np.abs(np.diff(column)))
+    moved = changes[changes > 0.0]
+    coarse = min(_COARSE * step, float(np.median(moved)))
+    beyond = np.maximum(changes - coarse, 0.0)
+    squares = np.concatenate([[0.0], np.cumsum(beyond**2)])
+    repeats = np.concatenate([[0], np.cumsum(changes == 0.0)])
+    width = np.clip(stop - first, _LEAST_WINDOW, _LARGEST_WINDOW)
+    sides = []
+    # The change that ends a freeze makes up for what was missed: it is no habit of the channel.
+    for low, high in ((first - 1 - width, first - 1), (stop + 1, stop + 1 + width)):
+        low, high = np.clip(low, 0, changes.size), np.clip(high, 0, changes.size)
+        count = high - low
+        spread = np.sqrt((squares[high] - squares[low]) / np.maximum(count, 1) / 2.0)
+        with np.errstate(divide="ignore"):
+            within = erf(coarse / (2.0 * np.sqrt(2.0) * spread))
+        share = (repeats[high] - repeats[low]) / np.maximum(count, 1)
+        sides.append(np.where(count >= _LEAST_WINDOW // 2, np.maximum(within, share), np.nan))
+    before, after = sides
+    # A record may begin at rest. Where it ends frozen, what came before tells.
+    return np.where(np.isnan(before), 1.0, np.fmax(before, after))
