@@ -1,5 +1,6 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -29,10 +30,11 @@ class CoreWorkbench:
         from twin_core.calibrate import calibrate
 
         spec = _spec(task.specification)
-        train, recent = task.telemetry.before(task.validation_us), task.telemetry.since(task.validation_us)
+        whole, telemetry = _screened(spec, task.telemetry)
+        train, recent = telemetry.before(task.validation_us), telemetry.since(task.validation_us)
         model = calibrate(
             spec,
-            [_record(spec, train)],
+            [replace(_record(spec, train), flaws=whole.flaws, notices=whole.notices)],
             method=task.method,
             progress=lambda fraction, message: progress(0.9 * fraction, message),
         )
@@ -138,6 +140,15 @@ def _record(spec: Any, telemetry: Telemetry) -> Any:
     time_s = (telemetry.time_us - telemetry.epoch_us) / 1e6
     values = {name: to_si(column, spec.channels[name].unit) for name, column in telemetry.values.items()}
     return Record(time_s, values, telemetry.epoch_us * 1000, "archive")
+
+
+def _screened(spec: Any, telemetry: Telemetry) -> tuple[Any, Telemetry]:
+    """Return the telemetry as a record without what cannot be readings, and the same in the channels' own units."""
+    from twin_core.network.screened import screened
+
+    record = screened(spec, _record(spec, telemetry))
+    values = {name: np.where(np.isnan(record.values[name]), np.nan, v) for name, v in telemetry.values.items()}
+    return record, replace(telemetry, values=values)
 
 
 def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:

@@ -13,6 +13,8 @@ from service.store.twins import Twin
 from twin_core.network.plausible import plausible_range
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
+from twin_core.quality.sentinels import marked
+from twin_core.units import to_si
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Entry:
     def refuse_implausible(self, values: NDArray[np.float64], first: int = 0, prefix: str = "values.") -> None:
         """Refuse what no instrument reads (422 naming the value), since a sample that is stored stays.
 
+        Markers of missing samples (-999, 0 K) are stored as they came: whoever reads them later masks them.
+
         Parameters
         ----------
         values : (n_rows, n_times)
@@ -52,6 +56,9 @@ class Entry:
         rows = slice(first, first + values.shape[0])
         low, high = (limit[rows] for limit in self.limits)
         wrong = (values < low) | (values > high)  # NaN compares as neither
+        for row in np.flatnonzero(wrong.any(axis=1)):
+            unit = self.units[self.channels[first + row]]
+            wrong[row] &= ~marked(to_si(values[row], unit), unit)
         if wrong.any():
             row, column = (int(i) for i in np.argwhere(wrong)[0])
             name = self.channels[first + row]

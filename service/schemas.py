@@ -220,6 +220,15 @@ class Network(_Answer):
     effects: list[dict[str, Any]]
 
 
+class MaskedSpan(_Answer):
+    """Samples next to each other, first and last, that are no readings: frozen, rail, sentinel or spike."""
+
+    start: Instant
+    stop: Instant
+    reason: str
+    samples: int
+
+
 class Residuals(_Answer):
     """Innovations (measured minus predicted one step ahead) and their normalised squares; thinned if ``downsampled``."""
 
@@ -227,6 +236,9 @@ class Residuals(_Answer):
     residual_K: dict[str, list[float | None]]
     nis: list[float | None]
     model_version: list[int]
+    masked: dict[str, list[MaskedSpan]] | None = Field(
+        default=None, description="Spans of each sensor that are no readings; null where the answer is too long to say."
+    )
     downsampled: bool = False
 
 

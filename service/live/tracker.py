@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.instants import format_instant
-from service.live import progress
+from service.live import progress, screening
 from service.live.caution import Caution, Rest
 from service.live.engine import Engine
 from service.live.position import RECENT, Position, is_far, next_count, stretch
@@ -16,7 +16,7 @@ from service.live.progress import Step
 from service.metrics import Metrics
 from service.problems import Problem
 from service.registry import Entry
-from service.store import models
+from service.store import models, samples
 from service.store.anomalies import Change
 from service.store.database import Database
 from service.store.gone import TwinGone
@@ -182,7 +182,8 @@ class Tracker:
         self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
-        telemetry, held = stretch(self.twin, fresh, active.epoch_us, before)
+        clean = await self._readings(fresh, before)
+        telemetry, held = stretch(self.twin, clean, active.epoch_us, before)
         try:
             done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
         except Exception as error:  # whatever it is, it would come again with the same samples
@@ -197,6 +198,16 @@ class Tracker:
         seq = before.seq if before is not None and reading.late_us is not None else reading.seq
         await self._keep(active, before, fresh, done, held, seq, reading.told)
         return True
+
+    async def _readings(self, fresh: Samples, before: Position | None) -> Samples:
+        """Return a block without what the samples before it show to be no readings."""
+        context = None
+        if before is not None:
+            n = len(self.twin.channels)
+            start_us = before.time_us - int(screening.CONTEXT * before.sampling_s * 1e6)
+            span_us = (start_us, int(fresh.time_us[0]))
+            context = await self._database.read(samples.select, self.twin.key, n, range(n), *span_us)
+        return await asyncio.to_thread(screening.readings, self.twin, context, fresh)
 
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""

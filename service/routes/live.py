@@ -10,18 +10,21 @@ from fastapi import APIRouter, Query, Response
 from service.deps import NamedTwin, Running, Service, reads
 from service.downsample import extremes
 from service.instants import format_instant, format_instants
-from service.live import forecasts
+from service.live import forecasts, screening
 from service.registry import Entry
 from service.routes.telemetry import MOST_POINTS, span
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Network, Residuals
-from service.store import anomalies, models, residuals
+from service.store import anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
+from service.store.samples import Samples
 
 router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
 
 Start = Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")]
 Stop = Annotated[str | None, Query(description="First instant after the last one wanted.")]
 Version = Annotated[int | None, Query(ge=1, le=2**62, description="Of the model; absent: the active one.")]
+MOST_SCREENED = 100_000
+"""Longer answers do not say what was masked: ask for a part."""
 Seconds = Annotated[float, Query(gt=0, allow_inf_nan=False)]
 SecondsOrNone = Annotated[float | None, Query(gt=0, allow_inf_nan=False)]
 
@@ -68,7 +71,7 @@ async def list_residuals(
     version: Version = None,
     max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
 ) -> Response:
-    """Return innovations, their predicted standard deviations and the NIS."""
+    """Return innovations, their predicted standard deviations and the NIS, and which samples are no readings, and why."""
     start_us, stop_us = span(start, stop)
     if version is not None:
         await service.database.read(models.get, twin.key, version)
@@ -79,11 +82,15 @@ async def list_residuals(
     found, count = await service.database.read(
         residuals.overview, twin.key, chosen, n_sensors, start_us, stop_us, max_points
     )
-    document = await asyncio.to_thread(_render, twin, found, count, max_points)
+    raw = None
+    if found.time_us.size and count <= MOST_SCREENED:
+        n, span_us = len(twin.channels), (int(found.time_us[0]), int(found.time_us[-1]) + 1)
+        raw = await service.database.read(samples.select, twin.key, n, range(n), *span_us)
+    document = await asyncio.to_thread(_render, twin, found, count, max_points, raw)
     return Response(document, media_type="application/json")
 
 
-def _render(twin: Entry, found: Found, count: int, max_points: int) -> bytes:
+def _render(twin: Entry, found: Found, count: int, max_points: int, raw: Samples | None) -> bytes:
     kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
 
     def columns(matrix: Any) -> dict[str, Any]:
@@ -95,6 +102,7 @@ def _render(twin: Entry, found: Found, count: int, max_points: int) -> bytes:
         "std_K": columns(found.innovation_std_K),
         "nis": np.ascontiguousarray(found.nis[kept]),
         "model_version": [found.version] * int(kept.size),
+        "masked": None if raw is None else screening.told(twin, raw, twin.sensors),
         "samples": count,
         "downsampled": kept.size < count,
     }

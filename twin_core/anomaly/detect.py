@@ -89,6 +89,7 @@ class _Sensor:
 
     def repeats(self, time: np.ndarray, reading: FloatArray, std_K: FloatArray) -> None:
         """Look for readings that repeat exactly: a run of them is a stuck sensor, more than usual a coarser one."""
+        std_K = self._lasting(std_K)  # a masked reading has no innovation, yet a stuck sensor is known by it
         valid = np.isfinite(reading) & np.isfinite(std_K)
         values, last = reading[valid], self._before.get("last")
         steps = np.abs(np.diff(values, prepend=np.nan if last is None else last))
@@ -109,6 +110,15 @@ class _Sensor:
             self.state["last"] = last
         if np.isfinite(finest[-1]):
             self.state["step"] = float(finest[-1])
+
+    def _lasting(self, std_K: FloatArray) -> FloatArray:
+        """Return the standard deviations, where one is missing that of the sample before, (n_times,)."""
+        known = np.concatenate([[self._before.get("std", np.nan)], std_K])
+        place = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(known.size), 0))
+        filled: FloatArray = known[place]
+        if np.isfinite(filled[-1]):
+            self.state["std"] = float(filled[-1])
+        return filled[1:]
 
     def missing(self, time: np.ndarray, reading: FloatArray) -> None:
         """Look for a sensor that stays away; one that never came is not missed."""

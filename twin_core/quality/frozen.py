@@ -7,10 +7,10 @@ that a rest that something ends, or that something led to, is no freeze. Near a 
 repeats has neighbours that move by less than one step per sample, so no turning point is taken for a freeze.
 """
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import erf
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.quality.policy import FALSE_ALARM_RATE, LEAST_READINGS
@@ -19,6 +19,7 @@ from twin_core.quality.runs import runs_of
 
 _LEAST_WINDOW, _LARGEST_WINDOW = 8, 64
 _COARSE = 3.0
+_erf = np.frompyfunc(math.erf, 1, 1)  # a service that starts needs no SciPy
 
 
 def frozen_rows(columns: Sequence[FloatArray]) -> BoolArray:
@@ -98,7 +99,7 @@ def _stay(column: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
         count = high - low
         spread = np.sqrt((squares[high] - squares[low]) / np.maximum(count, 1) / 2.0)
         with np.errstate(divide="ignore"):
-            within = erf(coarse / (2.0 * np.sqrt(2.0) * spread))
+            within = _erf(coarse / (2.0 * np.sqrt(2.0) * spread)).astype(np.float64)
         share = (repeats[high] - repeats[low]) / np.maximum(count, 1)
         sides.append(np.where(count >= _LEAST_WINDOW // 2, np.maximum(within, share), np.nan))
     before, after = sides
