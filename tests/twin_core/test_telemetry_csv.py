@@ -11,7 +11,7 @@ from twin_core.errors import TelemetryError, TwinError
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
-from twin_core.telemetry_csv import read_csv, write_csv
+from twin_core.telemetry_csv import read_csv, read_segments, write_csv
 
 
 @pytest.fixture
@@ -91,3 +91,56 @@ def test_nothing_is_left_where_it_cannot_be_written(tmp_path: Path, spec: TwinSp
     with pytest.raises(TwinError, match="cannot be written"):
         write_csv(tmp_path / "absent" / "a.csv", record, spec)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "instant",
+    [
+        "2026-121T06:00:00Z",
+        "2026:121:06:00:00",
+        "2026-121T06:00:00.000Z",
+        "2026:121:08:00:00+02:00",
+        "2026-05-01T06:00:00Z",
+    ],
+)
+def test_a_day_of_the_year_is_a_date(tmp_path: Path, spec: TwinSpec, instant: str) -> None:
+    """Day 121 of a common year: 31 + 28 + 31 + 30 days lie before the first of May."""
+    record = read_csv(written(tmp_path, f"time,T_a,T_b,Q_a\n{instant},20,290,1\n"), spec)
+    assert record.present(0.0) == "2026-05-01T06:00:00Z"
+
+
+@pytest.mark.parametrize("instant", ["2026-366T06:00:00Z", "2026-000T06:00:00Z", "2026:12:06:00:00"])
+def test_a_day_that_the_year_lacks_is_refused(tmp_path: Path, spec: TwinSpec, instant: str) -> None:
+    with pytest.raises(TelemetryError, match="row 2: column 'time' holds"):
+        read_csv(written(tmp_path, f"time,T_a,T_b,Q_a\n{instant},20,290,1\n"), spec)
+
+
+def test_repeated_instants_are_dropped_and_counted(tmp_path: Path, spec: TwinSpec) -> None:
+    rows = "0,20,290,1\n0,20,290,1\n5,21,290,1\n5,22,290,1\n5,,290,1\n9,23,290,1\n"
+    record = read_csv(written(tmp_path, f"time_s,T_a,T_b,Q_a\n{rows}"), spec)
+    np.testing.assert_array_equal(record.time_s, [0.0, 5.0, 9.0])
+    np.testing.assert_allclose(record.values["T_a"], [293.15, 294.15, 296.15])
+    assert "1 row(s) repeat the instant and the values" in record.notices[0]
+    assert "2 row(s) repeat the instant of the row before with other values; the first stays" in record.notices[1]
+
+
+def test_a_clock_that_jumps_back_begins_a_segment(tmp_path: Path, spec: TwinSpec) -> None:
+    time_s = [*range(30), *range(10, 15), *range(5, 45)]
+    rows = "".join(f"{t},{20 + 0.1 * row},290,1\n" for row, t in enumerate(time_s))
+    path = written(tmp_path, f"time_s,T_a,T_b,Q_a\n{rows}")
+    first, second = read_segments(path, spec)
+    np.testing.assert_array_equal(first.time_s, np.arange(30.0))
+    np.testing.assert_array_equal(second.time_s, np.arange(5.0, 45.0))
+    assert second.values["T_a"][0] == pytest.approx(293.15 + 3.5)
+    assert "jumps back 2 time(s), first in row 32" in first.notices[0] and "5 row(s) between jumps" in first.notices[0]
+    assert second.notices == ()
+    with pytest.raises(TelemetryError, match="its clock jumps back to 5"):
+        read_csv(path, spec)
+
+
+def test_markers_of_missing_samples_pass_the_door(tmp_path: Path, spec: TwinSpec) -> None:
+    """They are masked later, where the whole record is seen; what is no marker is refused as ever."""
+    record = read_csv(written(tmp_path, "time_s,T_a,T_b,Q_a\n0,-999,290,1\n1,20,0,1\n"), spec)
+    assert record.values["T_a"][0] == pytest.approx(-999 + 273.15) and record.values["T_b"][1] == 0.0
+    with pytest.raises(TelemetryError, match="holds -998 degC, which is below absolute zero"):
+        read_csv(written(tmp_path, "time_s,T_a,T_b,Q_a\n0,-998,290,1\n"), spec)

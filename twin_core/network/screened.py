@@ -1,10 +1,12 @@
 """Telemetry of a declared network, without samples that cannot be readings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from twin_core._typing import BoolArray
+from twin_core.network.doubts import doubts
 from twin_core.network.spec import Interval, TwinSpec
 from twin_core.quality import masked
 from twin_core.telemetry import Record
@@ -22,9 +24,14 @@ def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
 
 
 def screened(spec: TwinSpec, record: Record) -> Record:
-    """Return a record with what cannot be readings missing, and notices that say so; excluded samples stay as they are.
+    """Return a record with what cannot be readings missing, and notices that say so, and what in it is most likely a mistake.
+
+    Excluded samples stay as they are.
 
     Channels of the orbit are computed and need no screening; a record that was looked at before is returned as it is.
     """
+    if record.flaws is not None:
+        return record
     units = {name: channel.unit for name, channel in spec.channels.items()}
-    return masked(record, units, excluded(record, spec.exclude))
+    clean = masked(record, units, excluded(record, spec.exclude))
+    return replace(clean, notices=tuple(dict.fromkeys([*clean.notices, *doubts(spec, clean)])))

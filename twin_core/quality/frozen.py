@@ -18,7 +18,6 @@ from twin_core.quality.quantisation import resolution
 from twin_core.quality.runs import runs_of
 
 _LEAST_WINDOW, _LARGEST_WINDOW = 8, 64
-_COARSE = 3.0
 _erf = np.frompyfunc(math.erf, 1, 1)  # a service that starts needs no SciPy
 
 
@@ -62,11 +61,35 @@ def frozen_channel(column: FloatArray) -> BoolArray:
         return found
     same = values[1:] == values[:-1]
     first, stop = runs_of(same)
-    stay = np.maximum(same.mean(), _stay(values, first, stop))
+    stay = np.maximum.reduce(
+        [np.full(first.size, same.mean()), _stay(values, first, stop), _sticky(values, first, stop)]
+    )
     of_present = np.zeros(at.size, dtype=np.bool_)
     _mark(of_present, first, stop, _unlikely(stop - first, stay, at.size))
     found[at[of_present]] = True
     return found
+
+
+def _sticky(values: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
+    """Return how probable a repeat is as the other runs at the same value tell it, (n_runs,).
+
+    Some codes of a converter are far wider than others: what stays long at one value again and again is no freeze. The
+    longest of n runs has about log(n + 1) times the mean length, so it tells the probability, whatever the short ones do.
+    At the ends of the range it may be a rail, which repeats too.
+    """
+    length = (stop - first).astype(np.float64)
+    _, code = np.unique(values[first], return_inverse=True)
+    order = np.lexsort((length, code))
+    last = np.flatnonzero(np.diff(code[order], append=-1))
+    has_two = np.concatenate([[False], code[order][1:] == code[order][:-1]])[last]
+    longest = length[order[last]]
+    second = np.where(has_two, length[order[np.maximum(last - 1, 0)]], 0.0)
+    others = np.bincount(code) - 1.0
+    is_longest = np.zeros(first.size, dtype=np.bool_)
+    is_longest[order[last]] = True
+    rival = np.where(is_longest, second[code], longest[code])
+    inner = (values[first] > values.min()) & (values[first] < values.max()) & (rival > 0.0)
+    return np.where(inner, np.exp(-np.log(others[code] + 1.0) / np.maximum(rival, 1.0)), 0.0)
 
 
 def _unlikely(repeats: IntArray, stay: FloatArray, n_times: int) -> BoolArray:
@@ -84,10 +107,8 @@ def _mark(found: BoolArray, first: IntArray, stop: IntArray, unlikely: BoolArray
 
 def _stay(column: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
     """Return how probable it is, beside each run, that a reading is that of the sample before, (n_runs,)."""
-    step = resolution(column)
     changes = np.nan_to_num(np.abs(np.diff(column)))
-    moved = changes[changes > 0.0]
-    coarse = min(_COARSE * step, float(np.median(moved)))
+    coarse = resolution(column)
     beyond = np.maximum(changes - coarse, 0.0)
     squares = np.concatenate([[0.0], np.cumsum(beyond**2)])
     repeats = np.concatenate([[0], np.cumsum(changes == 0.0)])

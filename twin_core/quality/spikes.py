@@ -141,7 +141,7 @@ def _spread(excursions: list[tuple[FloatArray, FloatArray]], bound: float, size:
 def _end_spikes(time_s: FloatArray, values: FloatArray) -> BoolArray:
     """Return readings at either end of the record that lie farther from the rest than the rest spans.
 
-    Only one side speaks there, so that a fast transient cannot be told from a spike by its speed.
+    Only one side speaks there, so that a fast transient cannot be told from a spike by its speed; but a transient goes on.
     """
     found = np.zeros(values.size, dtype=np.bool_)
     for length in range(1, LONGEST_SPIKE + 1):
@@ -149,6 +149,7 @@ def _end_spikes(time_s: FloatArray, values: FloatArray) -> BoolArray:
             others = values[rest]
             span = float(np.ptp(others))
             off = np.abs(values[ends] - np.clip(values[ends], np.min(others), np.max(others)))
-            if float(off.min()) > span + largest_step(time_s[rest], others):
+            bound = largest_step(time_s[rest], others)
+            if float(off.min()) > span + bound and np.ptp(values[ends]) <= bound:
                 found[ends] = True
     return found

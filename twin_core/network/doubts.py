@@ -1,0 +1,106 @@
+"""What cannot be, or hardly, in telemetry and declaration together: units, signs, nodes that nothing reaches."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.constants import ZERO_CELSIUS_K
+from twin_core.network.quantities import guess_or
+from twin_core.network.spec import TwinSpec
+from twin_core.telemetry import Record
+
+LIKELY_K = (150.0, 400.0)
+"""Where the median of nearly every spacecraft's and laboratory's temperature lies."""
+
+TOO_MUCH = 100.0
+"""A step of heat that would move its node so many times as fast as it ever moves is taken for a unit that is wrong by 1000;
+a guessed capacity that is wrong by ten is not."""
+
+
+def doubts(spec: TwinSpec, record: Record) -> tuple[str, ...]:
+    """Return a sentence for everything that is most likely a mistake in the declaration of a channel or a node.
+
+    Parameters
+    ----------
+    spec
+        The declared network.
+    record
+        Telemetry in SI, without samples that are no readings.
+    """
+    return (*_temperatures(spec, record), *_powers(spec, record), *isolated(spec))
+
+
+def isolated(spec: TwinSpec) -> tuple[str, ...]:
+    """Return a sentence for every node that has neither a coupling nor a load."""
+    reached = {end for conductor in spec.conductors for end in conductor.between}
+    reached |= {radiator.node for radiator in spec.radiators} | {load.node for load in spec.loads}
+    return tuple(
+        f"node '{node.id}' has no coupling and no load: nothing can change its temperature; declare what does"
+        for node in spec.nodes
+        if node.id not in reached
+    )
+
+
+def _temperatures(spec: TwinSpec, record: Record) -> Iterator[str]:
+    for name, column in _present(spec, record, "temperature"):
+        unit, median_K = spec.channels[name].unit, float(np.median(column))
+        own = median_K - ZERO_CELSIUS_K if unit == "degC" else median_K
+        if unit == "K" and median_K < LIKELY_K[0] and LIKELY_K[0] < median_K + ZERO_CELSIUS_K < LIKELY_K[1]:
+            yield f"channel '{name}' is declared in K and reads {own:.4g} in the median: if that is degC, declare it so"
+        if (
+            unit == "degC"
+            and median_K > LIKELY_K[1]
+            and LIKELY_K[0] < own < LIKELY_K[1]
+            and _others_lower(spec, record, name)
+        ):
+            yield f"channel '{name}' is declared in degC and reads {own:.4g} in the median: if that is K, declare it so"
+
+
+def _others_lower(spec: TwinSpec, record: Record, name: str) -> bool:
+    """Return whether no other temperature in degC is as high but those that look like K too, or all do."""
+    medians = [float(np.median(c)) for n, c in _present(spec, record, "temperature") if n != name]
+    return all(median < LIKELY_K[1] or median - ZERO_CELSIUS_K > LIKELY_K[0] for median in medians)
+
+
+def _powers(spec: TwinSpec, record: Record) -> Iterator[str]:
+    for name, column in _present(spec, record, "power"):
+        unit = spec.channels[name].unit
+        if column.max() <= 0.0 and column.min() < 0.0:
+            span = f"{column.min():.4g} to {column.max() + 0.0:.4g} {unit}"
+            yield f"channel '{name}' is a power that is never positive ({span}): check its sign"
+        ratio = _too_fast(spec, record, name) if unit == "W" else 0.0
+        if ratio > TOO_MUCH:
+            yield (
+                f"channel '{name}' would move its node {ratio:.0f} times as fast as it ever moves: if it reads mW, convert it"
+                " to W; or correct the node's capacity"
+            )
+
+
+def _too_fast(spec: TwinSpec, record: Record, channel: str) -> float:
+    """Return how many times a channel's largest step of heat exceeds what moves its nodes; 0 where nothing tells."""
+    column = record.values[channel]
+    ratios = [0.0]
+    for load in spec.loads:
+        node = next(node for node in spec.nodes if node.id == load.node)
+        capacity = guess_or(node.capacity_J_per_K, 0.0)
+        if load.channel != channel or load.gain is not None or load.table is not None or capacity == 0.0:
+            continue
+        heat_W = load.weight * _largest_step(column)
+        seen_K = max((_largest_step(record.values[s]) for s in node.sensors if s in record.values), default=0.0)
+        if seen_K > 0.0 and record.time_s.size > 1:
+            ratios.append(heat_W * float(np.median(np.diff(record.time_s))) / capacity / seen_K)
+    return max(ratios)
+
+
+def _largest_step(column: FloatArray) -> float:
+    present = column[np.isfinite(column)]
+    return float(np.abs(np.diff(present)).max()) if present.size > 1 else 0.0
+
+
+def _present(spec: TwinSpec, record: Record, kind: str) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the used channels of one kind that have samples, without the missing ones."""
+    for name in spec.used_channels:
+        column = record.values.get(name)
+        if column is not None and spec.channels[name].kind == kind and np.isfinite(column).any():
+            yield name, column[np.isfinite(column)]
