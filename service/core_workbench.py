@@ -1,5 +1,6 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -15,6 +16,7 @@ from service.workbench import (
     Forecasted,
     ForecastTask,
     Json,
+    Masks,
     Outcome,
     Progress,
     Telemetry,
@@ -90,6 +92,14 @@ class CoreWorkbench:
         if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
             raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
         return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
+
+    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+        """Look for samples that are no readings."""
+        from twin_core.quality import screen
+        from twin_core.units import to_si
+
+        columns = {name: to_si(column, units[name]) for name, column in telemetry.values.items()}
+        return screen((telemetry.time_us - telemetry.epoch_us) / 1e6, columns, units).masks
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Progress = Callable[[float, str], None]
 Json = dict[str, Any]
+Masks = Mapping[str, Mapping[str, NDArray[np.bool_]]]
+"""Channel -> reason -> which samples are no readings, (n_times,)."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,9 @@ class Workbench(Protocol):
 
     def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Filter a stretch of telemetry; with a state its first sample is the one that the state already knows."""
+
+    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+        """Return which samples of channels in these units are no readings."""
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""

@@ -3,14 +3,14 @@
 import asyncio
 import logging
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
 from service.jobs.executor import prepare_worker
 from service.problems import Problem
-from service.workbench import Filtered, Forecasted, ForecastTask, Json, Outcome, Telemetry, Workbench
+from service.workbench import Filtered, Forecasted, ForecastTask, Json, Masks, Outcome, Telemetry, Workbench
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -34,6 +34,10 @@ class Engine:
     async def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Filter a stretch of telemetry."""
         return await self._ask(_assimilate, self._workbench, document, telemetry, state)
+
+    async def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+        """Return which samples are no readings."""
+        return await self._ask(_screen, self._workbench, dict(units), telemetry)
 
     async def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""
@@ -76,6 +80,10 @@ def _start(workers: int) -> ProcessPoolExecutor:
 
 def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
     return workbench().assimilate(document, telemetry, state)
+
+
+def _screen(workbench: type[Workbench], units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+    return workbench().screen(units, telemetry)
 
 
 def _forecast(workbench: type[Workbench], document: str, task: ForecastTask) -> Forecasted:

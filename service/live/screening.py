@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from service.instants import format_instant
+from service.live.engine import Engine
 from service.registry import Entry
 from service.store.samples import Samples
-from twin_core.quality import Screening, screen
+from service.workbench import Masks, Telemetry
 from twin_core.quality.runs import runs_of
-from twin_core.units import to_si
 
 CONTEXT = 256
 """So many samples before a block tell what its channels usually do."""
@@ -19,21 +19,21 @@ CONTEXT = 256
 Json = dict[str, Any]
 
 
-def screening(twin: Entry, found: Samples) -> Screening:
+async def masks_of(twin: Entry, engine: Engine, found: Samples) -> Masks:
     """Return which samples of all channels of a twin, as stored, are no readings."""
     if not found.time_us.size:
-        return Screening({})
-    columns = {name: to_si(found.values[row], twin.units[name]) for row, name in enumerate(twin.channels)}
-    return screen((found.time_us - found.time_us[0]) / 1e6, columns, twin.units)
+        return {}
+    values = {name: found.values[row] for row, name in enumerate(twin.channels)}
+    return await engine.screen(twin.units, Telemetry(int(found.time_us[0]), found.time_us, values))
 
 
-def readings(twin: Entry, context: Samples | None, fresh: Samples) -> Samples:
+async def readings(twin: Entry, engine: Engine, context: Samples | None, fresh: Samples) -> Samples:
     """Return a block without samples that cannot be readings.
 
     Parameters
     ----------
-    twin
-        Whose channels they are.
+    twin, engine
+        Whose channels they are, and who looks.
     context
         What came right before; None where the block is the first one.
     fresh
@@ -41,21 +41,23 @@ def readings(twin: Entry, context: Samples | None, fresh: Samples) -> Samples:
     """
     whole = fresh if context is None else _joined(context, fresh)
     values = fresh.values.copy()
-    for name, reasons in screening(twin, whole).masks.items():
+    for name, reasons in (await masks_of(twin, engine, whole)).items():
         row = twin.channels.index(name)
         for mask in reasons.values():
             values[row, mask[-fresh.time_us.size :]] = np.nan
     return Samples(fresh.time_us, values)
 
 
-def told(twin: Entry, found: Samples, names: Sequence[str]) -> dict[str, list[Json]]:
-    """Return the spans of each named channel that are no readings, with the reason, in the order of time."""
+def told(found: Samples, masks: Masks, names: Sequence[str], since_us: int) -> dict[str, list[Json]]:
+    """Return the spans of each named channel that are no readings, with the reason, in order; from an instant on."""
     spans: dict[str, list[Json]] = defaultdict(list)
-    for name, reasons in screening(twin, found).masks.items():
+    for name, reasons in masks.items():
         if name not in names:
             continue
         for reason, mask in reasons.items():
             for first, stop in zip(*(ends.tolist() for ends in runs_of(mask)), strict=True):
+                if found.time_us[stop - 1] < since_us:
+                    continue
                 start, last = (format_instant(int(found.time_us[at])) for at in (first, stop - 1))
                 spans[name].append({"start": start, "stop": last, "reason": reason, "samples": stop - first})
     return {name: sorted(rows, key=lambda row: str(row["start"])) for name, rows in spans.items()}

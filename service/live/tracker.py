@@ -182,9 +182,9 @@ class Tracker:
         self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
-        clean = await self._readings(fresh, before)
-        telemetry, held = stretch(self.twin, clean, active.epoch_us, before)
         try:
+            clean = await self._readings(fresh, before)
+            telemetry, held = stretch(self.twin, clean, active.epoch_us, before)
             done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
         except Exception as error:  # whatever it is, it would come again with the same samples
             self.trouble = str(error) if isinstance(error, TwinError | Problem) else f"{type(error).__name__}: {error}"
@@ -207,7 +207,7 @@ class Tracker:
             start_us = before.time_us - int(screening.CONTEXT * before.sampling_s * 1e6)
             span_us = (start_us, int(fresh.time_us[0]))
             context = await self._database.read(samples.select, self.twin.key, n, range(n), *span_us)
-        return await asyncio.to_thread(screening.readings, self.twin, context, fresh)
+        return await screening.readings(self.twin, self._engine, context, fresh)
 
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""

@@ -16,13 +16,13 @@ from service.routes.telemetry import MOST_POINTS, span
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Network, Residuals
 from service.store import anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
-from service.store.samples import Samples
 
 router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
 
 Start = Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")]
 Stop = Annotated[str | None, Query(description="First instant after the last one wanted.")]
 Version = Annotated[int | None, Query(ge=1, le=2**62, description="Of the model; absent: the active one.")]
+Spans = dict[str, list[dict[str, Any]]]
 MOST_SCREENED = 100_000
 """Longer answers do not say what was masked: ask for a part."""
 Seconds = Annotated[float, Query(gt=0, allow_inf_nan=False)]
@@ -82,15 +82,26 @@ async def list_residuals(
     found, count = await service.database.read(
         residuals.overview, twin.key, chosen, n_sensors, start_us, stop_us, max_points
     )
-    raw = None
-    if found.time_us.size and count <= MOST_SCREENED:
-        n, span_us = len(twin.channels), (int(found.time_us[0]), int(found.time_us[-1]) + 1)
-        raw = await service.database.read(samples.select, twin.key, n, range(n), *span_us)
-    document = await asyncio.to_thread(_render, twin, found, count, max_points, raw)
+    masked = None
+    if count <= MOST_SCREENED:
+        masked = await _masked(service, twin, found)
+    document = await asyncio.to_thread(_render, twin, found, count, max_points, masked)
     return Response(document, media_type="application/json")
 
 
-def _render(twin: Entry, found: Found, count: int, max_points: int, raw: Samples | None) -> bytes:
+async def _masked(service: Service, twin: Entry, found: Found) -> Spans:
+    """Return which of the sensors' samples that residuals belong to are no readings."""
+    if not found.time_us.size:
+        return {}
+    first_us, last_us = int(found.time_us[0]), int(found.time_us[-1])
+    usual_us = int(np.median(np.diff(found.time_us))) if found.time_us.size > 1 else 60_000_000
+    n, span_us = len(twin.channels), (first_us - screening.CONTEXT * usual_us, last_us + 1)
+    raw = await service.database.read(samples.select, twin.key, n, range(n), *span_us)
+    masks = await screening.masks_of(twin, service.live.engine, raw)
+    return screening.told(raw, masks, twin.sensors, first_us)
+
+
+def _render(twin: Entry, found: Found, count: int, max_points: int, masked: Spans | None) -> bytes:
     kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
 
     def columns(matrix: Any) -> dict[str, Any]:
@@ -102,7 +113,7 @@ def _render(twin: Entry, found: Found, count: int, max_points: int, raw: Samples
         "std_K": columns(found.innovation_std_K),
         "nis": np.ascontiguousarray(found.nis[kept]),
         "model_version": [found.version] * int(kept.size),
-        "masked": None if raw is None else screening.told(twin, raw, twin.sensors),
+        "masked": masked,
         "samples": count,
         "downsampled": kept.size < count,
     }

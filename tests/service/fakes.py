@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from service.workbench import (
     Forecasted,
     ForecastTask,
     Json,
+    Masks,
     Outcome,
     Progress,
     Telemetry,
@@ -85,6 +87,10 @@ class FakeWorkbench:
         last = np.where(np.isnan(read[-1]), before, read[-1])
         nis = np.nansum(innovation**2, axis=1)
         return Filtered(SENSORS, innovation, np.ones_like(innovation), nis, {"last": last.tolist()})
+
+    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+        """Take everything for a reading."""
+        return {}
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Hold the last readings; the planned power, if there is one, is added to them."""

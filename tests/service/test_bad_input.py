@@ -60,7 +60,7 @@ INGEST = [
     Case("no values", {"time": []}, 422, "values"),
     Case("an unknown member", {"time": [], "values": {}, "x": 1}, 422, "x"),
     Case("below absolute zero", columns([1, 2], T_px=[290.0, -1e300]), 422, "values.T_px[1]"),
-    Case("hotter than any reading", columns([1], T_px=[9999.0]), 422, "values.T_px[0]"),
+    Case("hotter than any reading", columns([1], T_px=[9998.0]), 422, "values.T_px[0]"),
     Case("another unit", columns([1], T_px=[17]) | {"units": {"T_px": "degC"}}, 422, "units.T_px"),
     Case("the unit of an unknown channel", columns([1]) | {"units": {"T_py": "K"}}, 422, "units.T_py"),
     Case("units are a list", columns([1]) | {"units": ["K"]}, 422, "units"),
