@@ -122,6 +122,51 @@ def test_close_loop_leaves_its_three_files(desk: Path, capsys: pytest.CaptureFix
     assert "the declared model suffices" in printed.out and printed.err == ""
 
 
+def spoilt(text: str) -> str:
+    """Return telemetry in which rows 101 to 130 repeat row 100, T_a leaps at rows 200 and 201, and T_b drops to 0 K at 300."""
+    head, *rows = text.splitlines()
+    cells = [row.split(",") for row in rows]
+    for row in range(101, 131):
+        cells[row][1:] = cells[100][1:]
+    for row in (200, 201):
+        cells[row][1] = f"{float(cells[row][1]) + 60.0:.4f}"
+    cells[300][2] = "0"
+    return "\n".join([head, *map(",".join, cells)]) + "\n"
+
+
+def test_what_is_no_reading_is_masked_told_and_drawn(
+    desk: Path, capsys: pytest.CaptureFixture[str], pair_telemetry: Callable[[int], str]
+) -> None:
+    data, out = desk / "spoilt.csv", desk / "spoilt"
+    data.write_text(spoilt(pair_telemetry(600)))
+    report = run(capsys, "close-loop", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", out)
+    assert report["verdict"] == "no_effect_supported"
+    assert sorted((row["channel"], row["reason"], row["samples"], row["spans"]) for row in report["quality"]) == [
+        ("Q_a", "frozen", 30, 1),
+        ("T_a", "frozen", 30, 1),
+        ("T_a", "spike", 2, 1),
+        ("T_b", "frozen", 30, 1),
+        ("T_b", "sentinel", 1, 1),
+    ]
+    page = (out / "report.html").read_text()
+    assert "Telemetry that is no reading" in page and page.count("<title>T_a: 2 spike") == 1
+
+
+def test_without_masking_every_sample_counts(
+    desk: Path, capsys: pytest.CaptureFixture[str], pair_telemetry: Callable[[int], str]
+) -> None:
+    data, model = desk / "raw.csv", desk / "raw.json"
+    data.write_text(spoilt(pair_telemetry(600)).replace(",0,", ",271.5,"))
+    arguments = ("calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
+    clean, raw = run(capsys, *arguments), run(capsys, *arguments, "--no-masking")
+    assert any("2 reading(s) of 'T_a' left out as spikes" in notice for notice in clean["notices"])
+    assert (
+        raw["notices"] == [] and raw["per_sensor"]["T_a"]["rmse_K"] > 2.0 > 0.1 > clean["per_sensor"]["T_a"]["rmse_K"]
+    )
+    forecast = ("forecast", "--model", model, "--telemetry", data, "--horizon", "600", "--out", desk / "raw_ahead.csv")
+    assert run(capsys, *forecast)["issued"] == run(capsys, *forecast, "--no-masking")["issued"]
+
+
 def test_simulate_in_both_formats(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scenario = {
         "scenario": "plate",
