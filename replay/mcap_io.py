@@ -21,6 +21,9 @@ from replay.recording import Recording, align
 
 Samples = dict[str, tuple[list[int], list[float]]]
 
+LEAST_SEGMENT = 20
+"""Fewer instants between two backward steps are no segment: the writer was out of order."""
+
 
 def write_mcap(
     path: Path | str,
@@ -82,10 +85,23 @@ def read_mcap(path: Path | str) -> Recording:
     RecordingError
         If the file is missing, truncated, not MCAP, not JSON-encoded, or holds no numeric message.
     """
-    source = Path(path)
+    (whole,) = _opened(Path(path), cut=False)
+    return whole
+
+
+def read_mcap_segments(path: Path | str) -> list[Recording]:
+    """Read an MCAP file as :func:`read_mcap` does, in the order in which it was written: a new segment where the clock jumps back.
+
+    Topics that were written a little out of order are no jump: where a segment would have fewer than ``LEAST_SEGMENT``
+    instants, the file is one segment in the order of time.
+    """
+    return _opened(Path(path), cut=True)
+
+
+def _opened(source: Path, *, cut: bool) -> list[Recording]:
     try:
         with source.open("rb") as stream:
-            return _read(source, stream)
+            return _read(source, stream, cut)
     except OSError as error:
         raise RecordingError(f"{source}: cannot be read ({error.strerror or error})") from error
     except (McapError, struct.error, UnicodeDecodeError, EOFError) as error:
@@ -93,7 +109,7 @@ def read_mcap(path: Path | str) -> Recording:
         raise RecordingError(f"{source}: not a complete MCAP file ({reason}); record or copy it again") from error
 
 
-def _read(source: Path, stream: IO[bytes]) -> Recording:
+def _read(source: Path, stream: IO[bytes], cut: bool) -> list[Recording]:
     if not source.stat().st_size:
         raise RecordingError(f"{source}: is empty; record or copy it again")
     reader = make_reader(stream)
@@ -112,7 +128,22 @@ def _read(source: Path, stream: IO[bytes]) -> Recording:
                 units[name] = channel.metadata["unit"]
     if not samples:
         raise RecordingError(f"{source}: holds no numeric messages")
-    return _assemble(samples, units, _metadata(reader))
+    metadata = _metadata(reader)
+    parts = [_assemble(part, units, metadata) for part in _forward(samples)] if cut else []
+    if len(parts) > 1 and min(len(part) for part in parts) >= LEAST_SEGMENT:
+        return parts
+    return [_assemble(samples, units, metadata)]
+
+
+def _forward(samples: Samples) -> list[Samples]:
+    """Return the samples before, between and after the instants at which the time of a topic goes back."""
+    parts: list[Samples] = []
+    for name, (times, values) in samples.items():
+        cuts = [0, *(np.flatnonzero(np.diff(times) < 0) + 1).tolist(), len(times)]
+        parts += [{} for _ in range(len(cuts) - 1 - len(parts))]
+        for part, first, stop in zip(parts, cuts, cuts[1:], strict=False):
+            part[name] = times[first:stop], values[first:stop]
+    return parts
 
 
 def _numbers(source: Path, topic: str, data: bytes) -> Iterator[tuple[str, float]]:
@@ -138,4 +169,4 @@ def _assemble(samples: Samples, units: dict[str, str], metadata: dict[str, str])
         for name, (times, values) in samples.items()
     }
     aligned = align(series)
-    return Recording(aligned.time_ns, aligned.columns, units, metadata)
+    return Recording(aligned.time_ns, aligned.columns, units, metadata, aligned.notices)

@@ -1,6 +1,6 @@
 """A recording: named columns on one strictly increasing axis of integer nanoseconds."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,12 +23,15 @@ class Recording:
         As the file states them; a column without a stated unit is absent.
     metadata
         Free text pairs of the file.
+    notices
+        What of the file was left out.
     """
 
     time_ns: NDArray[np.int64]
     columns: Mapping[str, NDArray[np.float64]]
     units: Mapping[str, str] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
+    notices: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Check axis and shapes; raise RecordingError naming the first offender."""
@@ -52,7 +55,7 @@ class Recording:
     def rows(self, selection: slice | NDArray[np.bool_]) -> "Recording":
         """Return some of the instants; there may be none."""
         columns = {name: column[selection] for name, column in self.columns.items()}
-        return Recording(self.time_ns[selection], columns, self.units, self.metadata)
+        return Recording(self.time_ns[selection], columns, self.units, self.metadata, self.notices)
 
 
 def align(series: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]) -> Recording:
@@ -61,14 +64,24 @@ def align(series: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]) -
     Parameters
     ----------
     series : name -> ((n_samples,), (n_samples,))
-        Nanoseconds and values in any order; of samples at the same nanosecond the first one stays.
+        Nanoseconds and values in any order; of samples at the same nanosecond the first one stays, and the notices count
+        the others.
     """
     axes = [times for times, _ in series.values()]
     time_ns = np.unique(np.concatenate(axes)) if axes else np.empty(0, dtype=np.int64)
-    columns = {}
+    columns, same, differing = {}, 0, 0
     for name, (times, values) in series.items():
         distinct, first = np.unique(times, return_index=True)
         column = np.full(time_ns.size, np.nan)
         column[np.searchsorted(time_ns, distinct)] = values[first]
         columns[name] = column
-    return Recording(time_ns, columns)
+        repeats = int(np.sum(values == column[np.searchsorted(time_ns, times)])) - distinct.size
+        same, differing = same + repeats, differing + times.size - distinct.size - repeats
+    return Recording(time_ns, columns, notices=tuple(_of_repeats(same, differing)))
+
+
+def _of_repeats(same: int, differing: int) -> Iterator[str]:
+    if same:
+        yield f"{same} sample(s) repeat the instant and the value of an earlier one; dropped"
+    if differing:
+        yield f"{differing} sample(s) repeat the instant of an earlier one with another value; the first stays"

@@ -1,13 +1,14 @@
 """Telemetry files of either format -> records in SI, and back."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from replay.errors import ReplayError
 from replay.mapping import apply_mapping, map_topics
-from replay.mcap_io import read_mcap, write_mcap
+from replay.mcap_io import read_mcap, read_mcap_segments, write_mcap
 from replay.recording import Recording
 from twin_core.errors import TelemetryError
 from twin_core.network.screened import screened
@@ -57,7 +58,13 @@ def load_segments(path: Path, spec: TwinSpec, *, masking: bool = True) -> list[R
         With one line naming the file and what is wrong.
     """
     check_suffix(path)
-    segments = read_segments(path, spec) if path.suffix == ".csv" else [load_record(path, spec)]
+    if path.suffix == ".csv":
+        segments = read_segments(path, spec)
+    else:
+        segments = [_from_recording(path, part, spec, None) for part in read_mcap_segments(path)]
+        if len(segments) > 1:
+            said = f"{path}: the clock jumps back {len(segments) - 1} time(s); a new segment begins at each"
+            segments[0] = replace(segments[0], notices=(*segments[0].notices, said))
     if masking:
         return [screened(spec, segment) for segment in segments]
     for segment in segments:
@@ -201,4 +208,5 @@ def _from_recording(path: Path, recording: Recording, spec: TwinSpec, required: 
             at = format_instant(int(named.time_ns[fault[0]])) if dated else f"{time_s[fault[0]]:g} s"
             raise TelemetryError(f"{name}: sample at {at}: channel '{channel}' {fault[1]}")
     ignored = ignored_notice(name, [mapping.get(topic, topic) for topic in topics], spec)
-    return Record(time_s, values, epoch_ns, name, ignored)
+    heard = tuple(f"{name}: {notice}" for notice in recording.notices)
+    return Record(time_s, values, epoch_ns, name, (*ignored, *heard))

@@ -9,7 +9,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from replay.errors import RecordingError
-from replay.mcap_io import read_mcap, write_mcap
+from replay.mcap_io import read_mcap, read_mcap_segments, write_mcap
+from replay.mcap_writer import McapWriter
 
 START_NS = 1_767_225_600_123_456_000
 
@@ -102,3 +103,30 @@ def test_failed_write_leaves_the_old_file(tmp_path: Path) -> None:
         write_mcap(tmp_path / "a.mcap", time_ns[::-1].copy(), values)
     assert (tmp_path / "a.mcap").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def _written(path: Path, samples: list[tuple[int, float]]) -> Path:
+    with McapWriter(path, ["T"]) as writer:
+        for instant_s, value in samples:
+            writer.add("T", instant_s * 10**9, value)
+    return path
+
+
+def test_a_clock_that_jumps_back_begins_a_segment(tmp_path: Path) -> None:
+    path = _written(
+        tmp_path / "a.mcap", [(t, t + 0.5) for t in range(100, 140)] + [(t, float(t)) for t in range(90, 130)]
+    )
+    first, second = read_mcap_segments(path)
+    np.testing.assert_array_equal(first.time_ns, np.arange(100, 140) * 10**9)
+    np.testing.assert_array_equal(second.columns["T"], np.arange(90.0, 130.0))
+    (whole,) = read_mcap_segments(_written(tmp_path / "b.mcap", [(5, 5.0), (4, 4.0), (6, 6.0)]))
+    np.testing.assert_array_equal(whole.columns["T"], [4.0, 5.0, 6.0])
+
+
+def test_repeated_instants_are_counted(tmp_path: Path) -> None:
+    recording = read_mcap(_written(tmp_path / "a.mcap", [(5, 5.0), (5, 5.0), (5, 7.0), (6, 6.0)]))
+    np.testing.assert_array_equal(recording.columns["T"], [5.0, 6.0])
+    assert [notice.split(";")[0] for notice in recording.notices] == [
+        "1 sample(s) repeat the instant and the value of an earlier one",
+        "1 sample(s) repeat the instant of an earlier one with another value",
+    ]
