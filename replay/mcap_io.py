@@ -90,7 +90,7 @@ def read_mcap(path: Path | str) -> Recording:
 
 
 def read_mcap_segments(path: Path | str) -> list[Recording]:
-    """Read an MCAP file as :func:`read_mcap` does, in the order in which it was written: a new segment where the clock jumps back.
+    """Read an MCAP file as :func:`read_mcap` does, but begin a new segment where its clock jumps back.
 
     Topics that were written a little out of order are no jump: where a segment would have fewer than ``LEAST_SEGMENT``
     instants, the file is one segment in the order of time.
