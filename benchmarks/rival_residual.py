@@ -28,7 +28,6 @@ from twin_core.effects import REGISTRY
 from twin_core.errors import TwinError
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.terms import Along
-from twin_core.simulate.kernels import GAMMA
 from twin_core.simulate.stages import balance_along
 from twin_core.telemetry import Record
 
@@ -133,7 +132,7 @@ class Residual:
         """Return the mean over every sampling interval of what is given at the stage points."""
         forcing = self.calibration.problem.segments[0].forcing
         steps = points.reshape(forcing.n_steps, 2, -1)
-        mean = (1.0 - GAMMA) * steps[:, 0] + GAMMA * steps[:, 1]
+        mean = steps.mean(axis=1)
         first = forcing.sample_step[:-1]
         total = np.add.reduceat(forcing.step_s[:, None] * mean, first, axis=0)
         return total / np.add.reduceat(forcing.step_s, first)[:, None]

@@ -14,7 +14,6 @@ from twin_core.calibrate.starting import filled_columns
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
 from twin_core.errors import ModelError
 from twin_core.network.terms import BoundaryConductor, ChannelLoad, Conductors, SinkRadiation
-from twin_core.simulate.kernels import GAMMA
 
 
 @dataclass(frozen=True)
@@ -135,14 +134,13 @@ def _cut(problem: Problem, balance: Balance, segment: Segment, n_steps: int, val
 def _given(problem: Problem, balance: Balance, segment: Segment) -> tuple[FloatArray, FloatArray]:
     """Return boundaries and inputs at the begin of every step and their change over it, (n_steps, n_given) each.
 
-    Inputs are held or linear over a step; both follow from their values at the two stages of the forcing.
+    Inputs are held or linear over a step.
     """
     forcing = segment.forcing
     inputs = [load.weight * forcing.inputs[load.channel] for load in balance.loads]
     solar = [x * forcing.sun_factor if load.solar else x for x, load in zip(inputs, balance.loads, strict=True)]
     stages = np.concatenate([forcing.boundaries_K, *(x[:, :, None] for x in solar)], axis=2)
-    end = stages[:, 1]
-    begin = end + (stages[:, 0] - end) / (1.0 - GAMMA)
+    begin, end = stages[:, 0], stages[:, 1]
     n_boundaries = forcing.boundaries_K.shape[2]
 
     def columns(x: FloatArray) -> FloatArray:

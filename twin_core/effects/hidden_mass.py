@@ -52,7 +52,7 @@ class HiddenMass(Effect):
         """Yield time constants C_h / G_h from a few samples to the length of the record."""
         time_s = survey.along.time_s
         steps = np.diff(time_s)
-        shortest = 2.0 * float(np.median(steps[steps > 0]))
+        shortest = float(np.median(steps[steps > 0]))
         longest = max(float(time_s[s][-1] - time_s[s][0]) for s in survey.segments())
         for tau in np.geomspace(shortest, longest, N_TIME_CONSTANTS):
             yield cls(where, {"C_J_per_K": 1.0, "G_W_per_K": 0.0}, {"tau_s": float(tau)})

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Self
 
+import numpy as np
+
 from twin_core._typing import FloatArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects.base import Effect, Quality, Survey, Where
@@ -33,6 +35,7 @@ class PairRadiation:
             (heat[:, None] * [1.0, -1.0]),
             pair_jacobian(-slope * own**3, slope * other**3),
             [Entry(0, self.first, unit), Entry(0, self.second, -unit)],
+            fourth_W_per_K4=STEFAN_BOLTZMANN_W_PER_M2_K4 * values[0] * np.array([[-1.0, 1.0], [1.0, -1.0]]),
         )
 
 

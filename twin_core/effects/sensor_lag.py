@@ -71,7 +71,7 @@ class SensorLag(Effect):
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield time constants from half a sample to a hundred."""
         steps = np.diff(survey.along.time_s)
-        sampling = 2.0 * float(np.median(steps[steps > 0]))
+        sampling = float(np.median(steps[steps > 0]))
         for tau in np.geomspace(0.5 * sampling, 100.0 * sampling, N_TIME_CONSTANTS):
             yield cls(where, {"tau_s": 0.0}, {"start_s": float(tau)})
 

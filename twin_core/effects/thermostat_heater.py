@@ -24,7 +24,7 @@ LEAP_K = 1.0
 """One step of a solver moves a threshold this far at most: its slope is felt at the switchings alone."""
 
 DELAY_SHARE, UNSETTLED = 0.002, 0.02
-"""Time constant of the memory over the sampling interval: a point after each switching, all but a hundredth is done, and that
+"""Time constant of the memory over the sampling interval: a step after each switching, all but a hundredth is done, and that
 counts as done."""
 
 
@@ -35,18 +35,18 @@ class Switching:
     Attributes
     ----------
     share
-        Share of full power: in a step that switches, what makes the heat of the step right, which may be more than all.
-    by_memory
-        Its slope with the share that is remembered at the same point.
+        Share of full power.
+    by_memory, by_temperature
+        Its slopes with the share that is remembered and with the temperature (1/K) at the same point.
     by_on, by_off
-        Its slope with either threshold, in 1/K: a switching instant moves along the temperature. The slope with the
-        temperature itself is minus their sum.
+        Its slope with either threshold, in 1/K: a switching instant moves along the temperature.
     called
         On (1), off (-1), or none of them known (0) after the point.
     """
 
     share: FloatArray
     by_memory: FloatArray
+    by_temperature: FloatArray
     by_on: FloatArray
     by_off: FloatArray
     called: IntArray
@@ -62,14 +62,13 @@ def switching(
 ) -> Switching:
     """Return how a thermostat switches along a temperature.
 
-    A threshold is crossed between two points, at the instant that a straight line tells. A point's heat counts in its step
-    for as long as the other point of the pair stands for, so each point of a step that switches has its share scaled from
-    the one to the other: the step then receives the heat from that instant on, and the share is continuous in it.
+    A threshold is crossed at the instant that a straight line over the step tells; the step receives the heat from that
+    instant on, held over all of it, so that the share is continuous in the instant.
 
     Parameters
     ----------
     time_s, temperature_K : (n_points,)
-        The two points of every step, step after step.
+        Begin and end of every step, step after step.
     on_K, off_K
         Thresholds.
     remembered : (n_points,)
@@ -77,34 +76,40 @@ def switching(
     rate_K_per_s
         How fast the temperature came to the first point.
     """
+    n_points = temperature_K.size
     beyond = np.where(temperature_K < on_K, 1, np.where(temperature_K > off_K, -1, 0))
-    latest = np.maximum.accumulate(np.where(beyond != 0, np.arange(beyond.size), -1))
+    latest = np.maximum.accumulate(np.where(beyond != 0, np.arange(n_points), -1))
     called = np.where(latest >= 0, beyond[latest], 0)
     before = np.concatenate([[0], called[:-1]])
-    old = np.where(before != 0, before == 1, remembered[0])
-    new = (called == 1).astype(np.float64)
-    changed = called != before
-    interval = _interval_s(time_s)
-    weight = interval / interval[np.minimum(np.arange(interval.size) ^ 1, interval.size - 1)]
-    travel = np.maximum(np.abs(np.diff(temperature_K, prepend=temperature_K[:1])), LEAST_TRAVEL_K)
-    travel[:1] = np.maximum(rate_K_per_s * interval[:1], LEAST_TRAVEL_K)
-    distance = np.where(called == 1, on_K - temperature_K, temperature_K - off_K)
-    passed = np.clip(distance / travel, 0.0, 1.0)
-    switched = np.where(changed, weight * passed, np.where(called == 0, 0.0, 1.0))
-    share = old + (new - old) * switched
-    slope = np.where(changed & (passed > 0.0) & (passed < 1.0), (new - old) * weight / travel, 0.0)
-    first = np.arange(0, called.size - 1, 2)
-    first = first[changed[first] & ~changed[first + 1]]
-    share[first + 1] += (new - old)[first] * (weight[first + 1] - 1.0)
-    from_memory = np.where((called == 0) | (np.arange(called.size) == 0), 1.0 - switched, 0.0)
-    return Switching(share, from_memory, np.where(called == 1, slope, 0.0), np.where(called == -1, -slope, 0.0), called)
-
-
-def _interval_s(time_s: FloatArray) -> FloatArray:
-    """Return how long it is to each point from the one before; the first step is cut as the second."""
-    if time_s.size < 3:
-        return np.ones(time_s.size)
-    return np.maximum(np.diff(time_s, prepend=time_s[0] - (time_s[2] - time_s[1])), 1e-9)
+    old = np.where(before != 0, before == 1, remembered[0]).astype(np.float64)
+    share = np.where(called != 0, called == 1, old)
+    by_memory = np.where(called == 0, 1.0, 0.0)
+    by_temperature, by_on, by_off = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
+    last = np.arange(1, n_points, 2)
+    last = last[called[last] != before[last]]
+    first = last - 1
+    travel = temperature_K[last] - temperature_K[first]
+    travel = np.copysign(np.maximum(np.abs(travel), LEAST_TRAVEL_K), travel)
+    threshold = np.where(called[last] == 1, on_K, off_K)
+    passed = (temperature_K[last] - threshold) / travel
+    gap = share[last] - old[last]
+    share[last] = share[first] = old[last] + gap * passed
+    by_memory[first] = by_memory[last] = np.where(before[last] == 0, 1.0 - passed, 0.0)
+    # Each point bears the part of the slope that comes through its own temperature; both count for half of the step.
+    by_temperature[first], by_temperature[last] = 2.0 * gap * passed / travel, 2.0 * gap * (1.0 - passed) / travel
+    for slope, which in ((by_on, 1), (by_off, -1)):
+        slope[first] = slope[last] = np.where(called[last] == which, -gap / travel, 0.0)
+    if n_points > 1 and called[0] != 0:  # how far beyond tells how long ago it was passed
+        reach = max(rate_K_per_s * float(time_s[1] - time_s[0]), LEAST_TRAVEL_K)
+        distance = on_K - temperature_K[0] if called[0] == 1 else temperature_K[0] - off_K
+        passed_first, gap_first = min(float(distance) / reach, 1.0), float(called[0] == 1) - remembered[0]
+        share[0] = remembered[0] + gap_first * passed_first
+        by_memory[0] = 1.0 - passed_first
+        if passed_first < 1.0:
+            slope_first = gap_first / reach * (1.0 if called[0] == 1 else -1.0)
+            by_temperature[0] = -slope_first
+            by_on[0], by_off[0] = (slope_first, 0.0) if called[0] == 1 else (0.0, slope_first)
+    return Switching(share, by_memory, by_temperature, by_on, by_off, called)
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,7 @@ class ThermostatHeat:
         temperature = along.temperatures_K[:, self.node]
         relay = switching(along.time_s, temperature, on_K, off_K, remembered, self.rate_K_per_s)
         rate, decay = self.memory.rate_K_per_s(state, relay.called)
-        by_node, by_state = -power * (relay.by_on + relay.by_off), power * relay.by_memory * slope
+        by_node, by_state = power * relay.by_temperature, power * relay.by_memory * slope
         jacobian = np.stack([np.stack([by_node, by_state], -1), np.stack([np.zeros_like(decay), decay], -1)], axis=-2)
         return Heat(
             (self.node, self.state),
@@ -220,7 +225,7 @@ class ThermostatHeater(Effect):
         lows, highs = np.quantile(temperature, ON_QUANTILES), np.quantile(temperature, OFF_QUANTILES)
         steps, moved = np.diff(survey.along.time_s), np.abs(np.diff(temperature))
         rate = float(np.quantile(moved[steps > 0] / steps[steps > 0], RATE_QUANTILE))
-        delay = DELAY_SHARE * 2.0 * float(np.median(steps[steps > 0]))
+        delay = DELAY_SHARE * float(np.median(steps[steps > 0]))
         for low, high in product(lows.tolist(), highs.tolist()):
             if high - low > LEAST_BAND_K:
                 settings = {"off_state_K": low, "on_state_K": high, "rate_K_per_s": rate, "delay_s": delay}

@@ -8,7 +8,6 @@ from twin_core._typing import FloatArray
 from twin_core.latent_force.linearised import Linearised
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import GAMMA
 from twin_core.simulate.stages import balance_along
 
 
@@ -27,9 +26,7 @@ def on_grid(forcing: Forcing, samples: FloatArray) -> FloatArray:
 def linearise_network(network: Network, forcing: Forcing) -> Callable[[FloatArray], Linearised]:
     """Return the function that linearises a network about temperatures, for :func:`smooth_extended`.
 
-    The balance is evaluated at the stages of the forcing (a share gamma into each step, and its end), where inputs are
-    known; its value at the start of the step follows on the straight line through both, which is exact for inputs held
-    or linear over the step.
+    The balance is evaluated at the begin and the end of each step, between which inputs are held or linear.
 
     Parameters
     ----------
@@ -47,15 +44,11 @@ def linearise_network(network: Network, forcing: Forcing) -> Callable[[FloatArra
 
     def about(temperatures_K: FloatArray) -> Linearised:
         n_steps, n = forcing.n_steps, temperatures_K.shape[1]
-        start, end = temperatures_K[:-1], temperatures_K[1:]
-        stages = np.stack([start + GAMMA * (end - start), end], axis=1)
+        stages = np.stack([temperatures_K[:-1], temperatures_K[1:]], axis=1)
         balance = balance_along(network, values, forcing, stages, 0, n_steps)
         rate = balance.rate_K_per_s.reshape(n_steps, 2, n)
-        first = rate[:, 1] - (rate[:, 1] - rate[:, 0]) / (1.0 - GAMMA)
         jacobian = balance.jacobian_per_s.reshape(n_steps, 2, n, n)
         capacity = balance.capacity_J_per_K.reshape(n_steps, 2, n).mean(axis=1)
-        return Linearised.about(
-            grid_times_s(forcing), temperatures_K, np.stack([first, rate[:, 1]], axis=1), jacobian, capacity
-        )
+        return Linearised.about(grid_times_s(forcing), temperatures_K, rate, jacobian, capacity)
 
     return about

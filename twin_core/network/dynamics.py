@@ -1,5 +1,6 @@
 """The heat balance C dT/dt = sum of heats, evaluated at many points at once, with its exact derivatives."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -88,6 +89,7 @@ def evaluate_balance(
     *,
     derivatives: bool = False,
     extra_W: FloatArray | None = None,
+    only: Sequence[int] | None = None,
 ) -> Balance:
     """Evaluate the heat balance of a network.
 
@@ -103,6 +105,8 @@ def evaluate_balance(
         Whether to return the parameter derivatives too.
     extra_W : (n_points, n_nodes)
         Heat beyond the terms.
+    only
+        Positions of the terms that are evaluated; all by default.
 
     Returns
     -------
@@ -115,8 +119,9 @@ def evaluate_balance(
     jacobian = JacobianSum(n_nodes)
     everywhere = tuple(range(n_nodes))
     entries: list[Entry] = []
-    for term, index in zip(network.terms, network.term_indices, strict=True):
-        part = term.evaluate(along, values[index])
+    for position in range(len(network.terms)) if only is None else only:
+        index = network.term_indices[position]
+        part = network.terms[position].evaluate(along, values[index])
         jacobian.add(part)
         if len(part.nodes) == 1:  # slices, which cost a fraction of index arrays
             heat[:, part.nodes[0]] += part.heat_W[:, 0]

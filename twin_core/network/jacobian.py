@@ -33,6 +33,13 @@ class Jacobian:
             out[:, i, j] += self.moving[:, entry]
         return out
 
+    def mean(self) -> FloatArray:
+        """Return the mean matrix over the points, (n_nodes, n_nodes)."""
+        out = self.constant.copy()
+        if self.moving.shape[0]:
+            np.add.at(out, (self.row, self.column), self.moving.mean(axis=0))
+        return out
+
     def with_columns_scaled(self, columns: Sequence[int], factor: FloatArray) -> "Jacobian":
         """Return the matrices with some columns scaled at each point: all their entries move then.
 

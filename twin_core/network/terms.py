@@ -64,6 +64,9 @@ class Heat:
         Entries whose item counts the term's ``parameters`` first, then what it ``borrows``.
     d_boundaries
         Entries whose item is the boundary.
+    fourth_W_per_K4 : (n_local, n_local)
+        Where all of the heat that depends on temperature is this constant matrix times T⁴; None for other heats. A heat
+        with one ``d_temperature`` for all of several points is that matrix times T.
     """
 
     nodes: tuple[int, ...]
@@ -71,6 +74,7 @@ class Heat:
     d_temperature: FloatArray
     d_values: list[Entry] = field(default_factory=list)
     d_boundaries: list[Entry] = field(default_factory=list)
+    fourth_W_per_K4: FloatArray | None = None
 
 
 class Term(Protocol):
@@ -236,6 +240,7 @@ class SinkRadiation:
             (-slope * square * temperature)[:, None, None],
             [Entry(0, self.node, unit)],
             [Entry(self.boundary, self.node, slope * sink_square * sink)],
+            np.full((1, 1), -STEFAN_BOLTZMANN_W_PER_M2_K4 * values[0]),
         )
 
 

@@ -1,4 +1,4 @@
-"""Telemetry as forcing: the time steps of a rollout with inputs and boundary temperatures at every stage."""
+"""Telemetry as forcing: the time steps of a rollout with inputs and boundary temperatures at both ends."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,10 +10,12 @@ from twin_core.errors import TelemetryError
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.terms import Along
-from twin_core.simulate.kernels import GAMMA
 from twin_core.simulate.orbit_inputs import orbit_inputs
 from twin_core.telemetry import Record
 from twin_core.units import sun_distance_au
+
+ENDS = np.array([0.0, 1.0])
+"""Places in a step at which rates are taken: its begin and its end, between which inputs are held or linear."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Forcing:
         Time of the initial state.
     step_s : (n_steps,)
     stage_time_s : (n_steps, 2)
+        Begin and end of each step.
     sample_step : (n_samples,)
         Steps taken before each sample.
     boundaries_K : (n_steps, 2, n_boundaries)
@@ -117,7 +120,7 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     interval = np.repeat(np.arange(intervals.size), divisions)
     within = np.arange(step.size) - np.repeat(np.cumsum(divisions) - divisions, divisions)
     begin = record.time_s[interval] + within * step
-    stage_time = begin[:, None] + step[:, None] * np.array([GAMMA, 1.0])
+    stage_time = begin[:, None] + step[:, None] * ENDS
     stage_interval = np.repeat(interval[:, None], 2, axis=1)
     boundaries = np.full((step.size, 2, len(spec.boundaries)), np.nan)
     for column, boundary in enumerate(spec.boundaries.values()):
@@ -129,7 +132,7 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
     inputs = {
         name: at_times(record, name, spec.channels[name].is_held, stage_time, interval=stage_interval)
         for name in _driving_channels(spec, record)
-    } | orbit_inputs(spec, record, begin, step, np.array([GAMMA, 1.0]))
+    } | orbit_inputs(spec, record, begin, step, ENDS)
     sample_step = np.concatenate([[0], np.cumsum(divisions)])
     sun = _sun_factor(spec, record, stage_time)
     start = float(record.time_s[0])

@@ -6,13 +6,15 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.network.model import Network
-from twin_core.network.storage import store, to_enthalpy_K, to_temperatures_K
+from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import GAMMA
+from twin_core.simulate.kernels import march, transitions
 from twin_core.simulate.rollout import LIMIT_K
+from twin_core.simulate.splitting import Split, anchors, less_modes, limits
 from twin_core.simulate.stages import balance_along
 
 N_NEWTON = 12
+TOLERANCE_K = 1e-6
 
 
 @dataclass(frozen=True)
@@ -23,6 +25,7 @@ class Steps:
     ----------
     ends_K : (n_steps, n_nodes)
     stages_K : (n_steps, 2, n_nodes)
+        Begin and end of each step.
     transition : (n_steps, n_nodes, n_nodes)
         d end / d start.
     heat_response_K_per_W : (n_steps, n_nodes, n_nodes)
@@ -65,33 +68,36 @@ def one_step(
         Newton's method to 1e-6 K, all steps at once.
     """
     n_steps, n_nodes = starts_K.shape
-    temperatures = np.repeat(starts_K[:, None], 2, axis=1) if near_K is None else near_K
-    starts, stages = to_enthalpy_K(network, values, starts_K), to_enthalpy_K(network, values, temperatures)
-    identity = np.eye(n_nodes)
-    scaled = GAMMA * forcing.step_s[:, None, None]
-    ratio = (1.0 - GAMMA) / GAMMA
-    inverse = np.broadcast_to(identity, (n_steps, 2, n_nodes, n_nodes))
-    own, slope = values[network.capacity_index], np.ones((n_steps, n_nodes))
+    own = values[network.capacity_index]
+    stages_K = np.repeat(starts_K[:, None], 2, axis=1) if near_K is None else near_K.copy()
+    stages_K[:, 0] = starts_K
+    forward, response = np.empty((n_steps, n_nodes, n_nodes)), np.empty((n_steps, n_nodes, n_nodes))
+    for first, last, about_K in anchors(starts_K):
+        split = Split.at(network, values, forcing, first, last, about_K)
+        more = 0.0 if extra_W is None else (extra_W[first:last] / own)[:, None]
+        stages_K[first:last] = _ends(split, stages_K[first:last], more)
+        balance = balance_along(network, values, forcing, stages_K[first:last], first, last)
+        entries = less_modes(balance.jacobian, split.slope_W_per_K, own)
+        ahead, by_rate = transitions(forcing.step_s[first:last], split.modes, *entries)
+        slope = balance.slope.reshape(-1, 2, n_nodes)
+        forward[first:last] = slope[:, 1, :, None] * ahead / slope[:, 0, None, :]
+        response[first:last] = slope[:, 1, :, None] * by_rate / own
+    return Steps(stages_K[:, 1], stages_K, forward, response)
+
+
+def _ends(split: Split, stages_K: FloatArray, more: FloatArray | float) -> FloatArray:
+    """Return the states at both ends of the steps of a stretch, each from its own start; ``more`` adds to the rates."""
+    network, values = split.network, split.values
+    lowest, highest = limits(network, values, LIMIT_K)
+    step_s = split.forcing.step_s[split.first : split.last]
+    stages = to_enthalpy_K(network, values, stages_K)
     for _ in range(N_NEWTON):
-        balance = balance_along(network, values, forcing, temperatures, 0, n_steps)
-        jacobian = balance.jacobian.dense().reshape(n_steps, 2, n_nodes, n_nodes)
-        rate = (balance.heat_W / own).reshape(n_steps, 2, n_nodes)
-        if extra_W is not None:
-            rate = rate + extra_W[:, None] / own
-        constant = rate - np.einsum("ksij,ksj->ksi", jacobian, stages)
-        inverse = np.linalg.inv(identity - scaled[:, None] * jacobian)
-        first = np.einsum("kij,kj->ki", inverse[:, 0], starts + scaled[:, 0] * constant[:, 0])
-        middle = starts + ratio * (first - starts) + scaled[:, 0] * constant[:, 1]
-        solved = np.stack([first, np.einsum("kij,kj->ki", inverse[:, 1], middle)], axis=1)
+        left, given = split.remainder(split.beside(stages_K, split.first, split.last), stages, split.first, split.last)
+        starts = np.ascontiguousarray(stages[:, 0])
+        solved, _ = march(step_s, split.modes, left, given + more, starts, lowest, highest)
         change = float(np.abs(solved - stages).max(initial=0.0))
-        temperatures = np.clip(to_temperatures_K(network, values, solved, temperatures, LIMIT_K), *LIMIT_K)
-        stages = solved if network.capacities else temperatures
-        slope = balance.slope[1::2]
-        if change < 1e-6:
+        stages = solved
+        stages_K = to_temperatures_K(network, values, solved, stages_K, LIMIT_K)
+        if not split.others or not change >= TOLERANCE_K:
             break
-    transition = inverse[:, 1] @ (identity + ratio * (inverse[:, 0] - identity))
-    response = (ratio * scaled * inverse[:, 1] @ inverse[:, 0] + scaled * inverse[:, 1]) / own
-    if network.capacities:
-        transition = slope[:, :, None] * transition / store(network, values, starts_K).slope[:, None, :]
-        response = slope[:, :, None] * response
-    return Steps(temperatures[:, 1], temperatures, transition, response)
+    return stages_K

@@ -1,9 +1,10 @@
 """The rollout: the heat balance integrated from one initial state.
 
-Steps are taken in the nodes' enthalpies: a capacity that changes within a step takes up all of its heat, and the implicit
-equations have one solution where the heats fall as the temperatures rise. Those of a whole stretch of steps are solved
-together by Newton's method: the heat balance is evaluated once for all points (vectorised), the linear recursion runs
-compiled. A stretch that does not converge is cut, down to one step; behind a sharp capacity the leading steps that do are kept.
+Steps are taken by the exponential trapezoidal rule of ``kernels``, in the nodes' enthalpies: a capacity that changes within a
+step takes up all of its heat. Where every term is a coupling (``splitting``) one compiled pass is the solution. The other
+terms are evaluated for all points of a stretch at once and linearised, and the passes repeated until nothing changes:
+Newton's method for a whole stretch. One that does not converge is cut, down to one step; behind a sharp capacity the leading
+steps that do are kept.
 """
 
 from dataclasses import dataclass
@@ -14,16 +15,13 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.network.model import Network
 from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import GAMMA, march
-from twin_core.simulate.stages import balance_along
-
-STRETCH = 1024
-"""Steps solved together at first: long enough to vectorise well, short enough for Newton to converge from a constant."""
+from twin_core.simulate.kernels import march
+from twin_core.simulate.splitting import STRETCH, Split, anchor_K, limits
 
 TOLERANCE_K = 1e-7
 N_NEWTON = 25
 LIMIT_K = (0.5, 5.0e3)
-"""Temperatures that Newton's iterates may visit; a solution at a limit is not a solution."""
+"""Temperatures that iterates may visit; a solution at a limit is not a solution."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,7 @@ class Rollout:
     Attributes
     ----------
     stages_K : (n_steps, 2, n_nodes)
-        Stage states; the second stage is the end of the step.
+        States at the begin and the end of each step.
     start_K : (n_nodes,)
     converged
         False where the balance has no solution within physical temperatures; the states are then NaN from there on.
@@ -70,64 +68,65 @@ def rollout(
     Rollout
         Converged to 1e-7 K, or with ``converged`` False.
     """
-    n_nodes = start_K.size
-    out = np.full((forcing.n_steps, 2, n_nodes), np.nan)
-    state, done, stretch = start_K.astype(np.float64), 0, STRETCH
-    while done < forcing.n_steps:
-        last = min(done + stretch, forcing.n_steps)
-        guess = np.broadcast_to(state, (last - done, 2, n_nodes)) if near is None else near[done:last]
-        solved = _newton(network, values, state, forcing, done, last, guess)
-        n_solved = solved.shape[0]
-        if n_solved == 0 and stretch == 1:
+    out = np.full((forcing.n_steps, 2, start_K.size), np.nan)
+    state, about_K = start_K.astype(np.float64), None
+    for first in range(0, forcing.n_steps, STRETCH):
+        last = min(first + STRETCH, forcing.n_steps)
+        about_K = anchor_K(state, about_K)
+        split = Split.at(network, values, forcing, first, last, about_K)
+        n_solved = _stretch(split, state, out[first:last], None if near is None else near[first:last])
+        if n_solved < last - first:
             return Rollout(out, start_K, False)
-        if n_solved < last - done:
-            stretch, near = max(1, n_solved, (last - done) // 4), None
-        else:
-            stretch = min(STRETCH, stretch * 2)
-        if n_solved > 0:
-            out[done : done + n_solved] = solved
-            state, done = solved[-1, 1], done + n_solved
+        state = out[last - 1, 1]
     return Rollout(out, start_K, True)
 
 
-def _newton(
-    network: Network,
-    values: FloatArray,
-    start_K: FloatArray,
-    forcing: Forcing,
-    first: int,
-    last: int,
-    guess: FloatArray,
-) -> FloatArray:
-    """Solve steps first..last-1 together for the enthalpies; return the stage states of leading steps that have settled.
+def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArray | None) -> int:
+    """Write the states of the steps of a stretch to ``out``; return how many have a solution."""
+    n_steps = out.shape[0]
+    if not split.others:
+        left, given = split.remainder(None, out, split.first, split.last)
+        low, high = limits(split.network, split.values, LIMIT_K)
+        step_s = split.forcing.step_s[split.first : split.last]
+        solved, n_solved = march(step_s, split.modes, left, given, start_K[None], low, high)
+        out[:n_solved] = solved[:n_solved]
+        return n_solved
+    state, done, stretch = start_K, 0, n_steps
+    while done < n_steps:
+        last = min(done + stretch, n_steps)
+        guess = np.broadcast_to(state, (last - done, 2, state.size)) if near is None else near[done:last]
+        solved = _newton(split, state, split.first + done, split.first + last, guess)
+        n_solved = solved.shape[0]
+        if n_solved == 0 and stretch == 1:
+            return done
+        if n_solved < last - done:
+            stretch, near = max(1, n_solved, (last - done) // 4), None
+        else:
+            stretch = min(n_steps, stretch * 2)
+        if n_solved > 0:
+            out[done : done + n_solved] = solved
+            state, done = solved[-1, 1], done + n_solved
+    return done
+
+
+def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: FloatArray) -> FloatArray:
+    """Solve steps first..last-1 together for the enthalpies; return the states of leading steps that have settled.
 
     A step settles once those before it have: where the method takes long for all, it has not been in vain for the first.
     """
-    n_steps, n_nodes = last - first, start_K.size
-    shape = (n_steps, 2, n_nodes)
+    network, values, n_steps = split.network, split.values, last - first
     temperatures = np.clip(guess, *LIMIT_K)
     start, stages = to_enthalpy_K(network, values, start_K), to_enthalpy_K(network, values, temperatures)
-    lowest, highest = (to_enthalpy_K(network, values, np.full(n_nodes, limit)) for limit in LIMIT_K)
-    change_before, settled = np.inf, 0
+    lowest, highest = limits(network, values, LIMIT_K)
+    step_s = split.forcing.step_s[first:last]
+    change_before, settled, n_inside = np.inf, 0, 0
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
-        balance = balance_along(network, values, forcing, temperatures, first, last)
-        jacobian, rate = balance.jacobian, (balance.heat_W / balance.own_J_per_K).reshape(shape)
-        solved = march(
-            forcing.step_s[first:last],
-            jacobian.constant,
-            jacobian.row,
-            jacobian.column,
-            jacobian.moving.reshape(n_steps, 2, jacobian.row.size),
-            rate,
-            stages,
-            start,
-            GAMMA,
-        )
+        left, given = split.remainder(split.beside(temperatures, first, last), stages, first, last)
+        solved, n_inside = march(step_s, split.modes, left, given, start[None], lowest, highest)
         changes = np.abs(solved - stages).max(axis=(1, 2))
         change = float(changes.max())
         if not np.isfinite(change):
             return solved[:0]
-        inside = bool((solved >= lowest).all() and (solved <= highest).all())
         # Newton's method contracts: the next change is no larger than this one times the last contraction (Hairer and
         # Wanner 1996, section IV.8), and the pass that would only confirm it is spared.
         contraction = min(1.0, change / change_before) if iteration > 0 else 1.0
@@ -138,12 +137,10 @@ def _newton(
         settled = int(np.argmax(changes >= TOLERANCE_K)) if network.capacities else 0
         # A step across a kink may swing from one side to the other: half the way ends that.
         stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved
-        stages = stages if inside else np.clip(stages, lowest, highest)
         temperatures = to_temperatures_K(network, values, stages, temperatures, LIMIT_K)
         if iteration > 8 and change > change_before and n_steps > 1:
             break
         change_before = change
-    leading = solved[:settled]
-    if not ((leading >= lowest).all() and (leading <= highest).all()):
+    if settled > n_inside:
         return solved[:0]
-    return to_temperatures_K(network, values, leading, temperatures[:settled], LIMIT_K)
+    return to_temperatures_K(network, values, solved[:settled], temperatures[:settled], LIMIT_K)

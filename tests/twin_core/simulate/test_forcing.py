@@ -11,7 +11,6 @@ from twin_core.errors import TelemetryError
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import Forcing, build_forcing
-from twin_core.simulate.kernels import GAMMA
 from twin_core.telemetry import Record
 
 TIME_S = np.array([0.0, 60.0, 90.0, 240.0])
@@ -50,7 +49,7 @@ def test_every_sample_ends_a_step() -> None:
     forcing = build(samples())
     np.testing.assert_array_equal(forcing.step_s, [60.0, 30.0, 150.0])
     np.testing.assert_array_equal(forcing.sample_step, [0, 1, 2, 3])
-    np.testing.assert_allclose(forcing.stage_time_s[:, 0], TIME_S[:-1] + GAMMA * np.diff(TIME_S))
+    np.testing.assert_allclose(forcing.stage_time_s[:, 0], TIME_S[:-1])
     np.testing.assert_allclose(forcing.stage_time_s[:, 1], TIME_S[1:])
 
 

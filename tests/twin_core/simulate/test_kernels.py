@@ -1,98 +1,191 @@
-"""The compiled recursions against the scheme written down with dense solves."""
+"""The compiled recursions against SciPy's matrix exponential, dense solves and central differences."""
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
-from twin_core.simulate.kernels import GAMMA, march, march_sensitivities
+from twin_core.simulate.kernels import Modes, Remainder, march, march_sensitivities, phi, transitions
+from twin_core.simulate.splitting import modes_of
 
-
-def scheme(step: float, jacobian: np.ndarray, constant: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """Alexander's two stages for f(Y) = g + J Y, (2, n)."""
-    identity = np.eye(state.size)
-    first = np.linalg.solve(identity - GAMMA * step * jacobian[0], state + GAMMA * step * constant[0])
-    slope = constant[0] + jacobian[0] @ first
-    middle = state + (1.0 - GAMMA) * step * slope + GAMMA * step * constant[1]
-    return np.array([first, np.linalg.solve(identity - GAMMA * step * jacobian[1], middle)])
+N, N_STEPS = 4, 12
+LOW, HIGH = np.full(N, -1e9), np.full(N, 1e9)
 
 
-def problem(n: int, n_steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Dense Jacobians without structure, so that rows must be exchanged in the factors."""
-    rng = np.random.default_rng(n)
+def coupling(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a symmetric coupling with losses, and capacities."""
+    rng = np.random.default_rng(seed)
+    pairs = np.triu(rng.uniform(0.0, 2.0, (N, N)), 1)
+    conductance = pairs + pairs.T
+    return conductance - np.diag(conductance.sum(axis=1) + rng.uniform(0.1, 1.0, N)), rng.uniform(50.0, 500.0, N)
+
+
+def dense_phi(matrix: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return e^(hA), h phi_1(hA) and h phi_2(hA) from one exponential (Al-Mohy and Higham 2011, theorem 2.1)."""
+    n = len(matrix)
+    big = np.zeros((3 * n, 3 * n))
+    big[:n, :n], big[:n, n : 2 * n], big[n : 2 * n, 2 * n :] = h * matrix, np.eye(n), np.eye(n)
+    found = expm(big)
+    return found[:n, :n], h * found[:n, n : 2 * n], h * found[:n, 2 * n :]
+
+
+def remainder(linear: np.ndarray, moving: np.ndarray, fourth: float = 0.0) -> Remainder:
+    """Return a remainder with full matrices, linear (N, N) and moving (N_STEPS, 2, N, N), and a fourth power on node 1."""
+    row, column = (index.ravel() for index in np.indices((N, N)))
+    one = np.array([1])
+    flat = np.ascontiguousarray(moving.reshape(len(moving), 2, N * N))
+    return Remainder(row, column, linear.ravel(), one, one, np.array([fourth]), row, column, flat)
+
+
+def problem(seed: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
     return (
-        rng.uniform(0.1, 3.0, n_steps),
-        rng.normal(size=(n_steps, 2, n, n)),
-        rng.normal(size=(n_steps, 2, n)),
-        rng.normal(size=n),
+        rng.choice([5.0, 20.0, 60.0, 61.3], N_STEPS),
+        rng.normal(0.0, 0.1, (N_STEPS, 2, N)),
+        size * rng.normal(0.0, 1e-3, (N, N)),
+        size * rng.normal(0.0, 1e-3, (N_STEPS, 2, N, N)),
+        rng.normal(300.0, 20.0, N),
     )
 
 
-def marched(step: np.ndarray, jacobian: np.ndarray, constant: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """March with every entry moving, about zero."""
-    n_steps, _, n, _ = jacobian.shape
-    row, column = (index.ravel() for index in np.indices((n, n)))
-    moving = jacobian.reshape(n_steps, 2, n * n)
-    return march(step, np.zeros((n, n)), row, column, moving, constant, np.zeros((n_steps, 2, n)), start, GAMMA)
+@pytest.mark.parametrize("z", [-1e4, -30.0, -1.0001, -0.9999, -1e-3, 0.0, 1e-9, 0.5, 3.0])
+def test_phi_is_what_one_large_exponential_says(z: float) -> None:
+    jordan = np.diag(np.ones(3), 1)
+    jordan[0, 0] = z
+    np.testing.assert_allclose(phi(z), expm(jordan)[0], rtol=1e-12, atol=1e-300)
 
 
-def test_march_is_the_scheme() -> None:
-    for n in (1, 2, 5):
-        step, jacobian, constant, start = problem(n, 12)
-        found = marched(step, jacobian, constant, start)
-        state = start
-        for k in range(step.size):
-            stages = scheme(step[k], jacobian[k], constant[k], state)
-            np.testing.assert_allclose(found[k], stages, rtol=1e-9, atol=1e-9 * np.abs(stages).max())
-            state = stages[1]
+@pytest.mark.parametrize("size", [0.0, 1.0, 8.0])
+def test_march_is_the_exponential_trapezoidal_rule(size: float) -> None:
+    """Small remainders go by fixed point, large ones by Newton's method: both to the solution of the linear step."""
+    slope, capacity = coupling(1)
+    step, given, linear, moving, start = problem(2, size)
+    modes, a = modes_of(slope, capacity), slope / capacity[:, None]
+    found, bad = march(step, modes, remainder(linear, moving), given, start[None], LOW, HIGH)
+    assert bad == N_STEPS
+    state = start
+    for k in range(N_STEPS):
+        keep, whole, late = dense_phi(a, step[k])
+        r0, r1 = (linear + moving[k, side] for side in (0, 1))
+        right = keep @ state + (whole - late) @ (given[k, 0] + r0 @ state) + late @ given[k, 1]
+        end = np.linalg.solve(np.eye(N) - late @ r1, right)
+        np.testing.assert_allclose(found[k], [state, end], rtol=1e-11, atol=1e-8)
+        state = end
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.3, 30.0])
-def test_march_about_any_states_with_a_few_moving_entries_is_the_scheme(size: float) -> None:
-    """One inverse for many steps, renewed where the step or the entries change too much, gives what dense solves give."""
-    rng = np.random.default_rng(3)
-    n, n_steps = 6, 40
-    step = np.repeat([20.0, 20.5, 60.0, 20.0], 10)
-    fixed = -np.diag(rng.uniform(1e-4, 1e-1, n)) + rng.uniform(0.0, 1e-3, (n, n))
-    row, column = np.array([0, 2, 2, 5]), np.array([0, 2, 3, 1])
-    moving = -size * rng.uniform(0.0, 1e-2, (n_steps, 2, 4))
-    about, rate = rng.normal(300.0, 10.0, (n_steps, 2, n)), rng.normal(0.0, 1e-2, (n_steps, 2, n))
-    jacobian = np.broadcast_to(fixed, (n_steps, 2, n, n)).copy()
-    for e in range(4):
-        jacobian[:, :, row[e], column[e]] += moving[:, :, e]
-    state = rng.normal(300.0, 10.0, n)
-    found = march(step, fixed, row, column, moving, rate, about, state, GAMMA)
-    for k in range(n_steps):
-        constant = rate[k] - np.einsum("sij,sj->si", jacobian[k], about[k])
-        stages = scheme(step[k], jacobian[k], constant, state)
-        np.testing.assert_allclose(found[k], stages, rtol=0.0, atol=1e-8)
-        state = stages[1]
+def test_steps_from_their_own_starts_are_single_steps() -> None:
+    slope, capacity = coupling(3)
+    step, given, linear, moving, _ = problem(4, 1.0)
+    modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-11)
+    starts = np.random.default_rng(5).normal(300.0, 20.0, (N_STEPS, N))
+    found, _ = march(step, modes, left, given, starts, LOW, HIGH)
+    for k in range(N_STEPS):
+        alone = left._replace(moving=left.moving[k : k + 1])
+        single, _ = march(step[k : k + 1], modes, alone, given[k : k + 1], starts[k : k + 1], LOW, HIGH)
+        np.testing.assert_allclose(found[k], single[0], atol=1e-8)
 
 
-def test_sensitivities_are_the_scheme_of_their_own_equation() -> None:
-    """d/dp of the scheme is the scheme for J s + df/dp; samples may be the start, repeated steps or absent."""
-    n, n_steps = 3, 10
-    step, jacobian, _, _ = problem(n, n_steps)
-    rng = np.random.default_rng(9)
-    column, node = np.array([0, 1, 1]), np.array([2, 0, 2])
-    series = rng.normal(size=(3, n_steps, 2))
-    start = rng.normal(size=(n, 3))
-    samples = np.array([0, 2, 3, 10])
-    observed = np.array([2, 0])
-    found, end = march_sensitivities(step, jacobian, column, node, series, start, samples, observed, GAMMA)
-    for c in range(3):
-        state, states = start[:, c], [start[:, c]]
-        for k in range(n_steps):
-            constant = np.zeros((2, n))
-            for e in range(3):
-                if column[e] == c:
-                    constant[:, node[e]] += series[e, k]
-            state = scheme(step[k], jacobian[k], constant, state)[1]
-            states.append(state)
-        np.testing.assert_allclose(found[:, :, c], np.array(states)[samples][:, observed], rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(end[:, c], state, rtol=1e-9, atol=1e-9)
+def test_what_leaves_the_limits_is_told() -> None:
+    slope, capacity = coupling(6)
+    step, given, linear, moving, start = problem(7, 0.0)
+    given[5:] += 1e6
+    found, bad = march(
+        step, modes_of(slope, capacity), remainder(linear, moving), given, start[None], LOW, np.full(N, 1e3)
+    )
+    assert bad == 5
+    assert np.nanmax(found) <= 1e3
 
 
-def test_the_scheme_is_stiffly_accurate_and_damps_at_infinity() -> None:
+def rolled(x: np.ndarray) -> tuple[np.ndarray, Modes, np.ndarray, Remainder, np.ndarray, np.ndarray]:
+    """Return a trajectory as a function of a coupling, a capacity, a heat, a remainder and a start."""
+    slope, capacity = coupling(8)
+    link = np.zeros((N, N))
+    link[np.ix_([0, 2], [0, 2])] = [[-1.0, 1.0], [1.0, -1.0]]
+    slope, capacity = slope + x[0] * link, capacity + x[1] * np.eye(N)[1]
+    step, given, linear, moving, start = problem(9, 1.0)
+    given = given + x[2] * np.eye(N)[3]
+    modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-10)
+    path, bad = march(step, modes, left, given, (start + x[3] * np.eye(N)[0])[None], LOW, HIGH)
+    assert bad == N_STEPS
+    return path, modes, slope / capacity[:, None], left, step, given
+
+
+def test_sensitivities_are_the_derivative_of_the_scheme_that_of_a_included() -> None:
+    """d A by a coupling and by a capacity; the remainder's own parameters stay."""
+    at = np.zeros(4)
+    path, modes, a, left, step, given = rolled(at)
+    _, capacity = coupling(8)
+    turns = np.zeros((2, N, N))
+    turns[0][np.ix_([0, 2], [0, 2])] = [[-1.0, 1.0], [1.0, -1.0]]
+    turns[0] /= capacity[:, None]
+    turns[1, 1] = -a[1] / capacity[1]
+    row, column = np.indices((N, N)).reshape(2, -1)
+    entry = left.linear + left.moving
+    entry[:, :, 5] += 4.0 * left.fourth[0] * path[:, :, 1] ** 3  # row 1, column 1
+    r = entry.reshape(N_STEPS, 2, N, N)
+    fourth = np.zeros_like(path)
+    fourth[:, :, 1] = -3.0 * left.fourth[0] * path[:, :, 1] ** 4  # u^4 is its slope times u less this
+    rate = path @ a.T + given + np.einsum("ksij,ksj->ksi", r, path) + fourth
+    series_node, series_column = np.array([0, 2, 1, 3]), np.array([0, 0, 1, 2])
+    series = np.stack(
+        [
+            (path[:, :, 2] - path[:, :, 0]) / capacity[0],
+            (path[:, :, 0] - path[:, :, 2]) / capacity[2],
+            (path @ turns[1].T)[:, :, 1],
+            np.ones((N_STEPS, 2)),
+        ]
+    )
+    start = np.zeros((N, 4))
+    start[0, 3] = 1.0
+    samples, observed = np.array([0, 2, 2, N_STEPS]), np.array([3, 0, 1])
+    found, end = march_sensitivities(
+        step,
+        modes,
+        row,
+        column,
+        entry,
+        path,
+        rate,
+        np.array([0, 1]),
+        modes.inward @ turns @ modes.outward,
+        series_column,
+        series_node,
+        series,
+        start,
+        samples,
+        observed,
+    )
+    for c, h in enumerate((1e-4, 1e-2, 1e-4, 1e-2)):
+        up, down = (rolled(sign * h * np.eye(4)[c])[0] for sign in (1.0, -1.0))
+        whole = (up - down) / (2.0 * h)
+        states = np.concatenate([whole[:1, 0], whole[:, 1]])
+        scale = np.abs(states).max()
+        np.testing.assert_allclose(found[:, :, c], states[samples][:, observed], atol=1e-6 * scale)
+        np.testing.assert_allclose(end[:, c], states[-1], atol=1e-6 * scale)
+
+
+def test_transitions_are_the_derivative_of_single_steps() -> None:
+    slope, capacity = coupling(10)
+    step, given, linear, moving, _ = problem(11, 3.0)
+    modes, left = modes_of(slope, capacity), remainder(linear, moving)
+    starts = np.random.default_rng(12).normal(300.0, 20.0, (N_STEPS, N))
+    row, column = np.indices((N, N)).reshape(2, -1)
+    forward, response = transitions(step, modes, row, column, left.linear + left.moving)
+    base, _ = march(step, modes, left, given, starts, LOW, HIGH)
+    for node in range(N):
+        unit = np.eye(N)[node]
+        moved, _ = march(step, modes, left, given, starts + unit, LOW, HIGH)
+        np.testing.assert_allclose(forward[:, :, node], moved[:, 1] - base[:, 1], atol=1e-8)
+        heated, _ = march(step, modes, left, given + unit, starts, LOW, HIGH)
+        np.testing.assert_allclose(response[:, :, node], heated[:, 1] - base[:, 1], atol=1e-8 * 60.0)
+
+
+def test_a_stiff_mode_lands_on_its_target() -> None:
     """With f = -rate (x - target), rate h -> infinity, one step lands on the target."""
-    rate, target = 1e12, 7.0
-    found = marched(np.ones(1), np.full((1, 2, 1, 1), -rate), np.full((1, 2, 1), rate * target), np.array([300.0]))
-    np.testing.assert_allclose(found[0, 1], target, atol=1e-8)
+    nothing = np.zeros(0, dtype=np.int64)
+    none = Remainder(
+        nothing, nothing, np.zeros(0), nothing, nothing, np.zeros(0), nothing, nothing, np.zeros((1, 2, 0))
+    )
+    modes = modes_of(np.array([[-1e12]]), np.ones(1))
+    given = np.full((1, 2, 1), 7e12)
+    found, _ = march(np.ones(1), modes, none, given, np.array([[300.0]]), LOW[:1], HIGH[:1])
+    np.testing.assert_allclose(found[0, 1], 7.0, atol=1e-8)

@@ -1,0 +1,284 @@
+"""The heat balance split for the integrator: what is linearised once, what is known at any temperature, and the rest.
+
+Most terms are linear in temperature, or in its fourth power, with factors that no step changes: one evaluation at any
+temperature tells them for all. Their Jacobian about round temperatures is the A of the exponential integrator. Terms of
+another kind (convection, relays, ramps of a conductance) are evaluated along the trajectory, again and again.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from twin_core._typing import FloatArray, IntArray
+from twin_core.constants import ZERO_CELSIUS_K
+from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
+from twin_core.network.jacobian import Jacobian
+from twin_core.network.model import Network
+from twin_core.network.storage import to_enthalpy_K
+from twin_core.network.terms import Along
+from twin_core.simulate.forcing import Forcing
+from twin_core.simulate.kernels import Modes, Remainder
+
+STRETCH = 1024
+"""Steps that are taken together, and after which A is renewed where temperatures have moved."""
+
+ROUND_K = 10.0
+"""A is linearised about temperatures rounded to this in degrees Celsius: a constant of the scheme, not of what is fitted."""
+FAR_K = 20.0
+"""A is renewed where a temperature is further away: T³ is then a quarter off at room temperature."""
+
+DIFFERENCE = 1e-4
+"""Relative step of a parameter; couplings are linear in theirs, so that a central difference is good to rounding."""
+
+
+def anchors(begins_K: FloatArray) -> Iterator[tuple[int, int, FloatArray]]:
+    """Yield (first step, last step, temperatures about which A is linearised) of each stretch of (n_steps, n_nodes)."""
+    about = None
+    for first in range(0, begins_K.shape[0], STRETCH):
+        about = anchor_K(begins_K[first], about)
+        yield first, min(first + STRETCH, begins_K.shape[0]), about
+
+
+def anchor_K(state_K: FloatArray, before_K: FloatArray | None) -> FloatArray:
+    """Return the round temperatures about which a stretch that begins at a state is linearised."""
+    if before_K is not None and np.abs(state_K - before_K).max() <= FAR_K:
+        return before_K
+    return np.asarray(np.maximum(ZERO_CELSIUS_K + ROUND_K * np.rint((state_K - ZERO_CELSIUS_K) / ROUND_K), ROUND_K))
+
+
+@dataclass(frozen=True)
+class Couplings:
+    """Terms that are linear in T and T⁴ with constant factors.
+
+    Attributes
+    ----------
+    linear_W_per_K, fourth_W_per_K4 : (n_nodes, n_nodes)
+        heat = linear @ T + fourth @ T⁴ + what is given.
+    heat_W : (n_points, n_nodes)
+        At the temperatures of the evaluation.
+    others
+        Positions of the remaining terms.
+    """
+
+    linear_W_per_K: FloatArray
+    fourth_W_per_K4: FloatArray
+    heat_W: FloatArray
+    others: tuple[int, ...]
+
+    def slope_W_per_K(self, about_K: FloatArray) -> FloatArray:
+        """Return d heat / d T, (n_nodes, n_nodes)."""
+        return self.linear_W_per_K + 4.0 * self.fourth_W_per_K4 * about_K**3
+
+
+def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
+    """Return the couplings of a network; ``along`` has two points at least, with one temperature per node."""
+    n_points, n = along.temperatures_K.shape
+    linear, fourth, heat = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n_points, n))
+    others = []
+    for position, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
+        part = term.evaluate(along, values[index])
+        block = np.ix_(part.nodes, part.nodes)
+        if part.fourth_W_per_K4 is not None:
+            fourth[block] += part.fourth_W_per_K4
+        elif part.d_temperature.shape[0] == 1:
+            linear[block] += part.d_temperature[0]
+        else:
+            others.append(position)
+            continue
+        heat[:, part.nodes] += part.heat_W
+    return Couplings(linear, fourth, heat, tuple(others))
+
+
+def probe(network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray) -> Along:
+    """Return the ends of the first step at given temperatures: enough to tell the couplings."""
+    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(0, 1))
+    return replace(forcing.along(np.tile(about_K, (2, 1)), boundaries, 0, 1), derivatives=False)
+
+
+def symmetric(slope_W_per_K: FloatArray, like: FloatArray | None = None) -> FloatArray:
+    """Return the symmetric part of a coupling: of each pair the weaker direction, none where they disagree in sign.
+
+    A reading that follows its node one way, say, is left to the corrector, which takes it as a given that changes over
+    the step. ``like`` decides where this is a derivative of that.
+    """
+    size = np.abs(slope_W_per_K if like is None else like)
+    sign = slope_W_per_K if like is None else like
+    own = size <= size.T
+    out = np.where(own, slope_W_per_K, slope_W_per_K.T)
+    out = np.where(size == size.T, 0.5 * (slope_W_per_K + slope_W_per_K.T), out)
+    return np.where(sign * sign.T > 0.0, out, 0.0) * (1.0 - np.eye(len(out))) + np.diag(np.diag(slope_W_per_K))
+
+
+def modes_of(slope_W_per_K: FloatArray, capacity_J_per_K: FloatArray) -> Modes:
+    """Return the modes of A = slope / C for a symmetric slope."""
+    root = np.sqrt(capacity_J_per_K)
+    rate, vectors = np.linalg.eigh(slope_W_per_K / (root[:, None] * root))
+    return Modes(rate, np.ascontiguousarray(vectors / root[:, None]), np.ascontiguousarray(vectors.T * root))
+
+
+@dataclass(frozen=True)
+class Split:
+    """The balance of a stretch of steps.
+
+    Attributes
+    ----------
+    network, values, forcing, first, last
+        Whose, and which steps.
+    about_K : (n_nodes,)
+        Where A is linearised.
+    parts
+        The couplings over the stretch, at ``about_K``.
+    """
+
+    network: Network
+    values: FloatArray
+    forcing: Forcing
+    first: int
+    last: int
+    about_K: FloatArray
+    parts: Couplings
+
+    @classmethod
+    def at(
+        cls, network: Network, values: FloatArray, forcing: Forcing, first: int, last: int, about_K: FloatArray
+    ) -> "Split":
+        """Evaluate the couplings of steps first..last-1."""
+        if network.capacities:
+            return cls(
+                network,
+                values,
+                forcing,
+                first,
+                last,
+                about_K,
+                couplings(network, values, probe(network, values, forcing, about_K)),
+            )
+        boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
+        points = np.broadcast_to(about_K, (2 * (last - first), about_K.size))
+        along = replace(forcing.along(points, boundaries, first, last), derivatives=False)
+        return cls(network, values, forcing, first, last, about_K, couplings(network, values, along))
+
+    @cached_property
+    def own_J_per_K(self) -> FloatArray:
+        """The nodes' own capacities, (n_nodes,)."""
+        return self.values[self.network.capacity_index]
+
+    @cached_property
+    def slope_W_per_K(self) -> FloatArray:
+        """C A, symmetric."""
+        return symmetric(self.parts.slope_W_per_K(self.about_K))
+
+    @cached_property
+    def modes(self) -> Modes:
+        """The modes of A."""
+        return modes_of(self.slope_W_per_K, self.own_J_per_K)
+
+    @property
+    def others(self) -> tuple[int, ...]:
+        """Terms that must be evaluated along the trajectory: all of them where a capacity changes with temperature."""
+        return tuple(range(len(self.network.terms))) if self.network.capacities else self.parts.others
+
+    @cached_property
+    def known(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rates that no temperature changes (n_steps, 2, n_nodes), and the factors of u less A and of u⁴."""
+        shape = (self.last - self.first, 2, self.about_K.size)
+        own = self.own_J_per_K
+        if self.network.capacities:
+            return np.zeros(shape), -self.slope_W_per_K / own[:, None], np.zeros((shape[2], shape[2]))
+        linear, fourth = self.parts.linear_W_per_K, self.parts.fourth_W_per_K4
+        given = self.parts.heat_W - (linear @ self.about_K + fourth @ self.about_K**4)
+        return (given / own).reshape(shape), (linear - self.slope_W_per_K) / own[:, None], fourth / own[:, None]
+
+    def beside(self, stages_K: FloatArray, first: int, last: int) -> Balance | None:
+        """Evaluate the other terms at stage states (n_steps, 2, n_nodes) of some steps; None where there are none."""
+        if not self.others:
+            return None
+        boundaries = fill_boundaries(self.network, self.values, self.forcing.boundaries_flat_K(first, last))
+        along = self.forcing.along(stages_K.reshape(-1, stages_K.shape[2]), boundaries, first, last)
+        return evaluate_balance(self.network, self.values, along, only=self.others)
+
+    def remainder(
+        self, beside: Balance | None, stages: FloatArray, first: int, last: int
+    ) -> tuple[Remainder, FloatArray]:
+        """Return r and the given rates of some steps, the other terms linearised about stage states (in enthalpy)."""
+        given, linear, fourth = self.known
+        given = given[first - self.first : last - self.first]
+        nothing = np.zeros(0, dtype=np.int64)
+        moving, at = np.zeros((last - first, 2, 0)), (nothing, nothing)
+        if beside is not None:
+            jacobian = beside.jacobian
+            flat = stages.reshape(-1, stages.shape[2])
+            rate = beside.heat_W / beside.own_J_per_K - flat @ jacobian.constant.T
+            np.subtract.at(rate.T, jacobian.row, (jacobian.moving * flat[:, jacobian.column]).T)
+            given, linear = given + rate.reshape(given.shape), linear + jacobian.constant
+            moving, at = jacobian.moving.reshape(last - first, 2, -1), (jacobian.row, jacobian.column)
+        size = np.abs(self.slope_W_per_K / self.own_J_per_K[:, None])
+        row, column = np.nonzero(np.abs(linear) > 1e-14 * size)
+        q_row, q_column = np.nonzero(fourth)
+        left = Remainder(
+            row,
+            column,
+            linear[row, column],
+            q_row,
+            q_column,
+            fourth[q_row, q_column],
+            *at,
+            np.ascontiguousarray(moving),
+        )
+        return left, np.ascontiguousarray(given)
+
+
+def less_modes(jacobian: Jacobian, slope_W_per_K: FloatArray, own: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the entries of a Jacobian less A: where they are, and (n_steps, 2, n_entries)."""
+    constant = jacobian.constant - slope_W_per_K / own[:, None]
+    row, column = np.nonzero(np.abs(constant) > 1e-14 * np.abs(jacobian.constant))
+    n_steps = jacobian.moving.shape[0] // 2
+    fixed = np.broadcast_to(constant[row, column], (n_steps, 2, row.size))
+    entry = np.concatenate([fixed, jacobian.moving.reshape(n_steps, 2, -1)], axis=2)
+    return np.concatenate([row, jacobian.row]), np.concatenate([column, jacobian.column]), np.ascontiguousarray(entry)
+
+
+def limits(network: Network, values: FloatArray, limit_K: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Return limits of temperature as enthalpies, (n_nodes,) each."""
+    lowest, highest = (to_enthalpy_K(network, values, np.full(len(network.nodes), limit)) for limit in limit_K)
+    return lowest, highest
+
+
+def turning(
+    network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray, split: Couplings
+) -> tuple[IntArray, FloatArray]:
+    """Return which free parameters change A, (n_turned,), and C dA / d free parameter, (n_turned, n_nodes, n_nodes)."""
+    parameters, own = network.parameters, values[network.capacity_index]
+    slope = split.slope_W_per_K(about_K)
+    position = {int(index): k for k, index in enumerate(parameters.free_index)}
+    at = parameters.at_values(values)
+    along = probe(network, values, forcing, about_K)
+    found: dict[int, FloatArray] = {}
+    for number, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
+        if number in split.others:
+            continue
+        for item, parameter in enumerate(index.tolist()):
+            if parameter not in position:
+                continue
+            step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
+            change = np.zeros_like(slope)
+            for sign in (1.0, -1.0):
+                moved = values[index].copy()
+                moved[item] += sign * step
+                part = term.evaluate(along, moved)
+                block = np.ix_(part.nodes, part.nodes)
+                change[block] += sign / (2.0 * step) * part.d_temperature[0]
+            if change.any():
+                found[parameter] = found.get(parameter, 0.0) + symmetric(change, slope)
+    mine = symmetric(slope)
+    for node, parameter in enumerate(network.capacity_index.tolist()):
+        if parameter in position and mine[node].any():
+            change = np.zeros_like(slope)
+            change[node] = -mine[node] / own[node]
+            found[parameter] = found.get(parameter, 0.0) + change
+    turned = np.array([position[p] for p in found], dtype=np.int64)
+    slopes = [at.parameters[p].transform.slope(at.parameters[p].free) for p in found]
+    n = own.size
+    return turned, np.array([s * change for s, change in zip(slopes, found.values(), strict=True)]).reshape(-1, n, n)
