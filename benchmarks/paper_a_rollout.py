@@ -3,11 +3,10 @@
 import resource
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 from threadpoolctl import threadpool_limits
 from torchdiffeq import odeint
@@ -25,6 +24,9 @@ from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TOLERANCES = tuple(10.0**-n for n in range(3, 13))
 """Relative and absolute (K) tolerances that the adaptive solvers are given, until they are as accurate as ours."""
@@ -150,6 +152,8 @@ SIZES = ((25, 250), (50, 500), (100, 1000), (200, 2000))
 
 def growth() -> str:
     """Return how the cost of a rollout grows with samples, nodes and conductors, and memory at a million samples."""
+    from matplotlib.figure import Figure  # the table of rollouts does without
+
     record, network = simulations()["combined", "A"].record, build_network(paper_spec())
     long = (build_problem(network, [_repeated(record, n)], np.full(9, 0.1), np.inf) for n in SAMPLES)
     by_samples = [_rollout_seconds(problem, 1 if n > 1e5 else 3) for n, problem in zip(SAMPLES, long, strict=True)]
@@ -181,7 +185,7 @@ def _rollout_seconds(problem: Problem, repeats: int) -> float:
     return seconds(lambda: rollout(network, network.parameters.values, segment.start_prior_K, segment.forcing), repeats)
 
 
-def _growth(axes: Axes, of: str, sizes: Sequence[int], taken: Sequence[float]) -> float:
+def _growth(axes: "Axes", of: str, sizes: Sequence[int], taken: Sequence[float]) -> float:
     """Draw seconds over a size and return the power with which they grow."""
     power, factor = np.polyfit(np.log(sizes), np.log(taken), 1)
     axes.loglog(sizes, taken, "o", label="measured")

@@ -10,7 +10,7 @@ import numpy as np
 from twin_core._typing import FloatArray, IntArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, ExtraNode, Layout
-from twin_core.network.terms import Along, Entry, Heat
+from twin_core.network.terms import Along, Entry, Heat, Relay
 from twin_core.parameters.parameter import Parameter, positive
 
 ON_QUANTILES = (0.005, 0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.7)
@@ -60,7 +60,7 @@ def switching(
     remembered: FloatArray,
     rate_K_per_s: float,
 ) -> Switching:
-    """Return how a thermostat switches along a temperature.
+    """Return how a thermostat switches along a given temperature; a rollout switches in its own steps (``kernels``).
 
     A threshold is crossed at the instant that a straight line over the step tells; the step receives the heat from that
     instant on, held over all of it, so that the share is continuous in the instant.
@@ -178,6 +178,16 @@ class ThermostatHeat:
                 Entry(1, self.node, power * relay.by_on),
                 Entry(2, self.node, power * relay.by_off),
             ],
+            relay=Relay(
+                self.node,
+                self.state,
+                power,
+                on_K,
+                off_K,
+                self.memory.off_K,
+                self.memory.on_K,
+                self.rate_K_per_s,
+            ),
         )
 
 

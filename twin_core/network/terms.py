@@ -49,6 +49,31 @@ class Entry(NamedTuple):
     series: FloatArray
 
 
+class Relay(NamedTuple):
+    """A heat that is switched by a temperature: on below one threshold, off above another, else as it was.
+
+    Attributes
+    ----------
+    node, memory
+        Whose temperature switches it and which state of unit capacity remembers it.
+    power_W, on_K, off_K
+        Its values, the first three of its term.
+    off_state_K, on_state_K
+        What the memory is where it is off and on; in between it stands for a share of full power.
+    rate_K_per_s
+        How fast the node comes to a threshold: tells how long ago one was passed that lies behind when a record begins.
+    """
+
+    node: int
+    memory: int
+    power_W: float
+    on_K: float
+    off_K: float
+    off_state_K: float
+    on_state_K: float
+    rate_K_per_s: float
+
+
 @dataclass(frozen=True)
 class Heat:
     """Heat of one term and its derivatives.
@@ -67,6 +92,8 @@ class Heat:
     fourth_W_per_K4 : (n_local, n_local)
         Where all of the heat that depends on temperature is this constant matrix times T⁴; None for other heats. A heat
         with one ``d_temperature`` for all of several points is that matrix times T.
+    relay
+        What switches the heat, for the integrator, which locates the instants itself.
     """
 
     nodes: tuple[int, ...]
@@ -75,6 +102,7 @@ class Heat:
     d_values: list[Entry] = field(default_factory=list)
     d_boundaries: list[Entry] = field(default_factory=list)
     fourth_W_per_K4: FloatArray | None = None
+    relay: Relay | None = None
 
 
 class Term(Protocol):

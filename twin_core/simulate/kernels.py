@@ -66,6 +66,97 @@ class Remainder(NamedTuple):
     moving: FloatArray
 
 
+class Relays(NamedTuple):
+    """Heats that a state switches, (n_relays,) each.
+
+    Attributes
+    ----------
+    node, memory
+        The state that switches it, and the one that remembers it.
+    low, high
+        On below, off above.
+    rate
+        What it adds to the rate of ``node`` at full power.
+    off, on
+        The memory where it is off and on.
+    approach
+        How fast the node comes to a threshold.
+    """
+
+    node: IntArray
+    memory: IntArray
+    low: FloatArray
+    high: FloatArray
+    rate: FloatArray
+    off: FloatArray
+    on: FloatArray
+    approach: FloatArray
+
+
+N_KICK = 22
+"""Columns of what ``march`` tells of each relay and step: its shares of full power at the begin and the end of the step; the
+slopes of both with the memory (2, 3), the node at the begin (4, 5), the low (6, 7) and the high threshold (8, 9) and the node
+at the end of the step as it were without a switch (10, 11). From 12 on, the first ten as they were without one."""
+
+UNSETTLED = 0.02
+"""A memory this near to off or on, as a share of the way between, is off or on."""
+
+
+@njit(cache=True, nogil=True)
+def _before(relays: Relays, r: int, state: FloatArray, step_s: float, kick: FloatArray) -> float:
+    """Tell a relay's shares unless a threshold is passed in the step; return the share in force at its end."""
+    kick[:] = 0.0
+    slope = (1.0 + UNSETTLED) / (relays.on[r] - relays.off[r])
+    share = slope * (state[relays.memory[r]] - relays.off[r]) - 0.5 * UNSETTLED
+    if share <= 0.0 or share >= 1.0:
+        slope, share = 0.0, min(max(share, 0.0), 1.0)
+    here = state[relays.node[r]]
+    if relays.low[r] <= here <= relays.high[r]:
+        kick[0], kick[1], kick[2], kick[3] = share, share, slope, slope
+        return share
+    now = 1.0 if here < relays.low[r] else 0.0
+    reach = max(relays.approach[r] * step_s, LEAST_TRAVEL)
+    beyond = relays.low[r] - here if now == 1.0 else here - relays.high[r]
+    passed, gap = min(beyond / reach, 1.0), now - share
+    kick[0], kick[1], kick[2] = share + gap * passed, now, (1.0 - passed) * slope
+    if passed < 1.0:
+        sign = 1.0 if now == 1.0 else -1.0
+        kick[4] = -sign * gap / reach
+        kick[6 if now == 1.0 else 8] = sign * gap / reach
+    return now
+
+
+@njit(cache=True, nogil=True)
+def _switch(relays: Relays, r: int, begin: float, end: float, share: float, kick: FloatArray) -> bool:
+    """Tell a relay's shares where the step passes a threshold; return whether it does.
+
+    The instant s is told by the chord of the step without a switch. The heat from it on enters as the straight line with its
+    mean and first moment over the step: what it adds is (1 - s)(1 - 3 s) at the begin and (1 - s)(1 + 3 s) at the end.
+    """
+    if end < relays.low[r] and share < 1.0 and begin >= relays.low[r]:
+        now, threshold, column = 1.0, relays.low[r], 6
+    elif end > relays.high[r] and share > 0.0 and begin <= relays.high[r]:
+        now, threshold, column = 0.0, relays.high[r], 8
+    else:
+        return False
+    kick[12:] = kick[:10]
+    travel, gap = end - begin, now - share
+    s = (threshold - begin) / travel
+    by_s = (gap * (6.0 * s - 4.0), gap * (2.0 - 6.0 * s))
+    shares = ((1.0 - s) * (1.0 - 3.0 * s), (1.0 - s) * (1.0 + 3.0 * s))
+    for side in range(2):
+        kick[side] += gap * shares[side]
+        kick[2 + side] *= 1.0 - shares[side]
+        kick[4 + side] -= by_s[side] * (1.0 - s) / travel
+        kick[column + side] += by_s[side] / travel
+        kick[10 + side] -= by_s[side] * s / travel
+    return True
+
+
+LEAST_TRAVEL = 0.005
+"""A state that moves less over a step counts as moving this far where its way tells an instant, in K."""
+
+
 @njit(cache=True, nogil=True)
 def phi(z: float) -> tuple[float, float, float, float]:
     """Return phi_0 = exp to phi_3: by Taylor's series of phi_3 where z is small, and phi_k = z phi_(k+1) + 1 / k!."""
@@ -245,11 +336,12 @@ def march(
     step_s: FloatArray,
     modes: Modes,
     left: Remainder,
+    relays: Relays,
     given: FloatArray,
     starts: FloatArray,
     lowest: FloatArray,
     highest: FloatArray,
-) -> tuple[FloatArray, int]:
+) -> tuple[FloatArray, FloatArray, int]:
     """Advance the states; each step's end is corrected until it rests.
 
     Parameters
@@ -259,6 +351,8 @@ def march(
         Of A.
     left
         r(u).
+    relays
+        Each switches within the step in which its state passes a threshold.
     given : (n_steps, 2, n)
         Rates that no state changes, at the begin and the end of each step.
     starts : (1, n) or (n_steps, n)
@@ -268,21 +362,20 @@ def march(
 
     Returns
     -------
-    (n_steps, 2, n), int
-        States at the begin and the end of each step, and the first step that left the limits or did not come to rest
-        (n_steps where there is none). From the first that is not finite on, they are NaN.
+    (n_steps, 2, n), (n_steps, n_relays, N_KICK), int
+        States at the begin and the end of each step; what each relay did; and the first step that left the limits or did not
+        come to rest (n_steps where there is none). From the first that is not finite on, the states are NaN.
     """
-    n_steps, n = step_s.size, starts.shape[1]
+    n_steps, n, n_relays = step_s.size, starts.shape[1], relays.node.size
     chained = starts.shape[0] == 1
-    out = np.full((n_steps, 2, n), np.nan)
+    out, kicks = np.full((n_steps, 2, n), np.nan), np.zeros((n_steps, n_relays, N_KICK))
     keep, whole, late = np.empty(n), np.empty(n), np.empty(n)
-    dense_late, lu, pivots = np.empty((n, n)), np.empty((n, n)), np.empty(n, dtype=np.int64)
-    column = np.empty((n, 1))
-    right, first_g, base, now_g, pushed = np.empty(n), np.empty(n), np.empty(n), np.empty(n), np.empty(n)
-    state, mode, ahead, moved = starts[0].copy(), np.empty(n), np.empty(n), np.zeros(n)
+    dense_late = np.empty((n, n))
+    first_g, base, ahead, moved = np.empty(n), np.empty(n), np.empty(n), np.zeros(n)
+    begin, end, pushed, shares = np.empty(n), np.empty(n), np.empty(n), np.empty(n_relays)
+    state, mode = starts[0].copy(), np.empty(n)
     _multiply(modes.inward, state, mode)
     at_s, dense_s, bad = np.nan, np.nan, n_steps
-    alone = left.linear.size + left.fourth.size + left.moving_row.size == 0
     for k in range(n_steps):
         if not chained:
             state[:] = starts[k]
@@ -292,79 +385,141 @@ def march(
             at_s = step_s[k]
             _weights(at_s, modes.rate_per_s, keep, whole, late)
         out[k, 0] = state
-        _remainder(left, k, 0, given[k, 0], state, right)
-        _multiply(modes.inward, right, first_g)
         for i in range(n):
-            base[i] = whole[i] * (modes.rate_per_s[i] * mode[i] + first_g[i]) - late[i] * first_g[i]
             ahead[i] = state[i] + guess_share * moved[i]
-        change, before, contraction, settled = np.inf, np.inf, 1.0, False
-        for iteration in range(N_FIXED):
-            _remainder(left, k, 1, given[k, 1], ahead, right)
-            _multiply(modes.inward, right, now_g)
+        for r in range(n_relays):
+            shares[r] = _before(relays, r, state, at_s, kicks[k, r])
+        settled = False
+        for attempt in range(2):
+            begin[:], end[:] = given[k, 0], given[k, 1]
+            for r in range(n_relays):
+                begin[relays.node[r]] += relays.rate[r] * kicks[k, r, 0]
+                end[relays.node[r]] += relays.rate[r] * kicks[k, r, 1]
+            _remainder(left, k, 0, begin, state, pushed)
+            _multiply(modes.inward, pushed, first_g)
             for i in range(n):
-                now_g[i] = base[i] + late[i] * now_g[i]
-            _multiply(modes.outward, now_g, pushed)
-            change = 0.0
-            for i in range(n):
-                change = max(change, abs(state[i] + pushed[i] - ahead[i]))
-                ahead[i] = state[i] + pushed[i]
-            if iteration > 0:
-                contraction = change / before if before > 0.0 else 0.0
-            if alone or change * min(contraction, 1.0) < STEP_K:
-                settled = True
+                base[i] = whole[i] * (modes.rate_per_s[i] * mode[i] + first_g[i]) - late[i] * first_g[i]
+            settled = _fixed_point(modes, left, k, late, end, state, base, ahead, pushed)
+            if not settled:
+                if at_s != dense_s:
+                    dense_s = at_s
+                    _dense(modes.outward, late, modes.inward, dense_late)
+                settled = _newton(modes, left, k, late, dense_late, end, state, base, lowest, highest, ahead)
+                _multiply(modes.inward, ahead - state, pushed)
+            switched = False
+            if attempt == 0 and settled:
+                for r in range(n_relays):
+                    node = relays.node[r]
+                    if _switch(relays, r, state[node], ahead[node], shares[r], kicks[k, r]):
+                        switched = True
+                        shares[r] = 1.0 if ahead[node] < relays.low[r] else 0.0
+            if not switched:
                 break
-            if contraction > CONTRACTION and iteration > 0:
-                break
-            before = change
-        if not settled:
-            if at_s != dense_s:
-                dense_s = at_s
-                _dense(modes.outward, late, modes.inward, dense_late)
-            for i in range(n):
-                if not np.isfinite(ahead[i]):
-                    ahead[i] = state[i]
-                ahead[i] = min(max(ahead[i], lowest[i]), highest[i])
-            for _ in range(N_NEWTON):
-                _remainder(left, k, 1, given[k, 1], ahead, right)
-                _multiply(modes.inward, right, now_g)
-                for i in range(n):
-                    now_g[i] = base[i] + late[i] * now_g[i]
-                _multiply(modes.outward, now_g, pushed)
-                for i in range(n):
-                    column[i, 0] = state[i] + pushed[i] - ahead[i]
-                    for j in range(n):
-                        lu[i, j] = 1.0 if i == j else 0.0
-                _subtract_slope(left, k, ahead, dense_late, lu)
-                _factorise(lu, pivots)
-                _solve_columns(lu, pivots, column)
-                change = 0.0
-                for i in range(n):
-                    change = max(change, abs(column[i, 0]))
-                    ahead[i] = min(max(ahead[i] + column[i, 0], lowest[i]), highest[i])
-                if not change >= STEP_K:
-                    settled = change < STEP_K
-                    break
-            for i in range(n):
-                pushed[i] = ahead[i] - state[i]
-            _multiply(modes.inward, pushed, now_g)
         inside = settled
         for i in range(n):
+            if not np.isfinite(ahead[i]):
+                return out, kicks, min(bad, k)
             if not (ahead[i] > lowest[i] and ahead[i] < highest[i]):
                 inside = False
-                if not np.isfinite(ahead[i]):
-                    return out, min(bad, k)
                 ahead[i] = min(max(ahead[i], lowest[i]), highest[i])
-        if inside:
+        recalled = False
+        for r in range(n_relays):
+            if _recalled(relays, r, state, kicks[k, r]):
+                ahead[relays.memory[r]] = relays.on[r] if shares[r] == 1.0 else relays.off[r]
+                recalled = True
+        if inside and not recalled:
             for i in range(n):
-                mode[i] += now_g[i]
+                mode[i] += pushed[i]
         else:
-            bad = min(bad, k)
             _multiply(modes.inward, ahead, mode)
+        if not inside:
+            bad = min(bad, k)
         for i in range(n):
             moved[i] = ahead[i] - state[i]
             state[i] = ahead[i]
+        for r in range(n_relays):
+            moved[relays.memory[r]] = 0.0
         out[k, 1] = state
-    return out, bad
+    return out, kicks, bad
+
+
+@njit(cache=True, nogil=True)
+def _fixed_point(
+    modes: Modes,
+    left: Remainder,
+    k: int,
+    late: FloatArray,
+    given: FloatArray,
+    state: FloatArray,
+    base: FloatArray,
+    ahead: FloatArray,
+    pushed: FloatArray,
+) -> bool:
+    """Correct the end of step k until it rests; False where that takes long. ``pushed`` is how far its modes have moved."""
+    n = state.size
+    right, change, before = np.empty(n), np.inf, np.inf
+    alone = left.linear.size + left.fourth.size + left.moving_row.size == 0
+    for iteration in range(N_FIXED):
+        _remainder(left, k, 1, given, ahead, right)
+        _multiply(modes.inward, right, pushed)
+        for i in range(n):
+            pushed[i] = base[i] + late[i] * pushed[i]
+        _multiply(modes.outward, pushed, right)
+        change = 0.0
+        for i in range(n):
+            change = max(change, abs(state[i] + right[i] - ahead[i]))
+            ahead[i] = state[i] + right[i]
+        contraction = 1.0 if iteration == 0 else (change / before if before > 0.0 else 0.0)
+        if alone or change * min(contraction, 1.0) < STEP_K:
+            return True
+        if not (iteration == 0 or contraction < CONTRACTION):
+            return False
+        before = change
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _newton(
+    modes: Modes,
+    left: Remainder,
+    k: int,
+    late: FloatArray,
+    dense_late: FloatArray,
+    given: FloatArray,
+    state: FloatArray,
+    base: FloatArray,
+    lowest: FloatArray,
+    highest: FloatArray,
+    ahead: FloatArray,
+) -> bool:
+    """Solve for the end of step k by Newton's method; False where that takes long."""
+    n = state.size
+    right, pushed, column = np.empty(n), np.empty(n), np.empty((n, 1))
+    lu, pivots = np.empty((n, n)), np.empty(n, dtype=np.int64)
+    for i in range(n):
+        if not np.isfinite(ahead[i]):
+            ahead[i] = state[i]
+        ahead[i] = min(max(ahead[i], lowest[i]), highest[i])
+    for _ in range(N_NEWTON):
+        _remainder(left, k, 1, given, ahead, right)
+        _multiply(modes.inward, right, pushed)
+        for i in range(n):
+            pushed[i] = base[i] + late[i] * pushed[i]
+        _multiply(modes.outward, pushed, right)
+        for i in range(n):
+            column[i, 0] = state[i] + right[i] - ahead[i]
+            for j in range(n):
+                lu[i, j] = 1.0 if i == j else 0.0
+        _subtract_slope(left, k, ahead, dense_late, lu)
+        _factorise(lu, pivots)
+        _solve_columns(lu, pivots, column)
+        change = 0.0
+        for i in range(n):
+            change = max(change, abs(column[i, 0]))
+            ahead[i] = min(max(ahead[i] + column[i, 0], lowest[i]), highest[i])
+        if not change >= STEP_K:
+            return change < STEP_K
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -378,6 +533,89 @@ def _add_product(weight: FloatArray, row: IntArray, column: IntArray, entry: Flo
 
 
 @njit(cache=True, nogil=True)
+def _answer(
+    relays: Relays,
+    r: int,
+    kick: FloatArray,
+    early: FloatArray,
+    late: FloatArray,
+    lu: FloatArray,
+    pivots: IntArray,
+    out: FloatArray,
+) -> None:
+    """Write how the end of a step answers to a relay's shares at its begin and end, (n, 2)."""
+    for i in range(out.shape[0]):
+        out[i, 0] = relays.rate[r] * early[i, relays.node[r]]
+        out[i, 1] = relays.rate[r] * late[i, relays.node[r]]
+    if np.any(kick[2:12] != 0.0):
+        _solve_columns(lu, pivots, out)
+
+
+@njit(cache=True, nogil=True)
+def _shares(
+    relays: Relays,
+    r: int,
+    kick: FloatArray,
+    relay_column: IntArray,
+    relay_slope: FloatArray,
+    state: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Write how a relay's shares at both ends of a step answer to the columns by memory, begin and thresholds, (2, n_columns)."""
+    for side in range(2):
+        out[side] = kick[2 + side] * state[relays.memory[r]] + kick[4 + side] * state[relays.node[r]]
+        for which in range(2):
+            if relay_column[which, r] >= 0:
+                out[side, relay_column[which, r]] += kick[6 + 2 * which + side] * relay_slope[which, r]
+
+
+@njit(cache=True, nogil=True)
+def _unswitched(
+    modes: Modes,
+    relays: Relays,
+    r: int,
+    kick: FloatArray,
+    early: FloatArray,
+    late: FloatArray,
+    relay_column: IntArray,
+    relay_slope: FloatArray,
+    divided: FloatArray,
+    turned: IntArray,
+    turning: FloatArray,
+    lu: FloatArray,
+    pivots: IntArray,
+    n_columns: int,
+) -> FloatArray:
+    """Return what the end of a relay's node would answer more to the columns if the relay had not switched, (n_columns,)."""
+    n, node = early.shape[0], relays.node[r]
+    more = (kick[12] - kick[0], kick[13] - kick[1])
+    columns, pushed = np.zeros((n, n_columns)), np.empty(n)
+    for which in range(2, 4):
+        if relay_column[which, r] >= 0:
+            for i in range(n):
+                by_rate = more[0] * early[i, node] + more[1] * late[i, node]
+                columns[i, relay_column[which, r]] += relay_slope[which, r] * by_rate
+    for t in range(turned.size):
+        for i in range(n):
+            pushed[i] = 0.0
+            for j in range(n):
+                by_rate = more[0] * divided[1, i, j] + more[1] * divided[2, i, j]
+                pushed[i] += turning[t, i, j] * by_rate * relays.rate[r] * modes.inward[j, node]
+        for i in range(n):
+            for j in range(n):
+                columns[i, turned[t]] += modes.outward[i, j] * pushed[j]
+    _solve_columns(lu, pivots, columns)
+    return columns[node].copy()
+
+
+@njit(cache=True, nogil=True)
+def _recalled(relays: Relays, r: int, begin: FloatArray, kick: FloatArray) -> bool:
+    """Return whether a relay's memory was set in a step: its threshold lay behind, or was passed."""
+    inside = relays.low[r] <= begin[relays.node[r]] <= relays.high[r]
+    return not inside or kick[10] != 0.0 or kick[11] != 0.0
+
+
+@njit(cache=True, nogil=True)
 def march_sensitivities(
     step_s: FloatArray,
     modes: Modes,
@@ -386,6 +624,10 @@ def march_sensitivities(
     entry: FloatArray,
     stages: FloatArray,
     rate: FloatArray,
+    relays: Relays,
+    kicks: FloatArray,
+    relay_column: IntArray,
+    relay_slope: FloatArray,
     turned: IntArray,
     turning: FloatArray,
     entry_column: IntArray,
@@ -407,6 +649,11 @@ def march_sensitivities(
         The Jacobian less A, at the begin and the end of each step.
     stages, rate : (n_steps, 2, n)
         The trajectory and f along it.
+    relays, kicks
+        The relays, and what ``march`` tells of them.
+    relay_column, relay_slope : (4, n_relays)
+        Which columns the low and the high threshold and the rate depend on, the last by its power and by the capacity (-1 for
+        none), and how.
     turned : (n_turned,)
         Columns that change A.
     turning : (n_turned, n, n)
@@ -432,6 +679,7 @@ def march_sensitivities(
     divided, mixed = np.empty((3, n, n)), np.empty((n, n))
     matrix, pivots = np.empty((n, n)), np.empty(n, dtype=np.int64)
     work, pushed = np.empty((n, n_columns)), np.empty(n)
+    vector, responses = np.empty((n, 2)), np.empty((2, n_columns))
     mode, g = np.empty((2, n)), np.empty((2, n))
     state = start.copy()
     sample, at_s = 0, np.nan
@@ -490,6 +738,37 @@ def march_sensitivities(
                 matrix[i, j] = (1.0 if i == j else 0.0) - matrix[i, j]
         _factorise(matrix, pivots)
         _solve_columns(matrix, pivots, work)
+        for r in range(relays.node.size):
+            kick, node = kicks[k, r], relays.node[r]
+            _answer(relays, r, kick, dense_early, dense_late, matrix, pivots, vector)
+            without = work[node].copy()  # how the node would end without a switch
+            if kick[10] != 0.0 or kick[11] != 0.0:
+                without += _unswitched(
+                    modes,
+                    relays,
+                    r,
+                    kick,
+                    dense_early,
+                    dense_late,
+                    relay_column,
+                    relay_slope,
+                    divided,
+                    turned,
+                    turning,
+                    matrix,
+                    pivots,
+                    n_columns,
+                )
+                _shares(relays, r, kick[12:], relay_column, relay_slope, state, responses)
+                without += vector[node, 0] * responses[0] + vector[node, 1] * responses[1]
+            _shares(relays, r, kick[:10], relay_column, relay_slope, state, responses)
+            for side in range(2):
+                responses[side] += kick[10 + side] * without
+            for i in range(n):
+                for c in range(n_columns):
+                    work[i, c] += vector[i, 0] * responses[0, c] + vector[i, 1] * responses[1, c]
+            if _recalled(relays, r, stages[k, 0], kicks[k, r]):
+                work[relays.memory[r]] = 0.0
         state[:] = work
         while sample < sample_step.size and sample_step[sample] == k + 1:
             for o in range(observed.size):
@@ -500,15 +779,26 @@ def march_sensitivities(
 
 @njit(cache=True, nogil=True)
 def transitions(
-    step_s: FloatArray, modes: Modes, row: IntArray, column: IntArray, entry: FloatArray
+    step_s: FloatArray,
+    modes: Modes,
+    row: IntArray,
+    column: IntArray,
+    entry: FloatArray,
+    begins: FloatArray,
+    relays: Relays,
+    kicks: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return d end / d begin and d end / d a held rate of every step, (n_steps, n, n) each; arguments as above."""
+    """Return d end / d begin and d end / d a held rate of every step, (n_steps, n, n) each.
+
+    Arguments as above; ``begins`` (n_steps, n) are the states before each step.
+    """
     n_steps, n = step_s.size, modes.rate_per_s.size
     forward, response = np.empty((n_steps, n, n)), np.empty((n_steps, n, n))
     keep, whole, late = np.empty(n), np.empty(n), np.empty(n)
     dense_keep, dense_whole = np.empty((n, n)), np.empty((n, n))
     dense_early, dense_late = np.empty((n, n)), np.empty((n, n))
     matrix, pivots, both = np.empty((n, n)), np.empty(n, dtype=np.int64), np.empty((n, 2 * n))
+    vector = np.empty((n, 2))
     at_s = np.nan
     for k in range(n_steps):
         if step_s[k] != at_s:
@@ -528,5 +818,16 @@ def transitions(
                 matrix[i, j] = (1.0 if i == j else 0.0) - matrix[i, j]
         _factorise(matrix, pivots)
         _solve_columns(matrix, pivots, both)
+        for r in range(relays.node.size):
+            _answer(relays, r, kicks[k, r], dense_early, dense_late, matrix, pivots, vector)
+            row_of = both[relays.node[r]].copy()
+            for side in range(2):
+                for i in range(n):
+                    for c in range(2 * n):
+                        both[i, c] += vector[i, side] * kicks[k, r, 10 + side] * row_of[c]
+                    both[i, relays.memory[r]] += vector[i, side] * kicks[k, r, 2 + side]
+                    both[i, relays.node[r]] += vector[i, side] * kicks[k, r, 4 + side]
+            if _recalled(relays, r, begins[k], kicks[k, r]):
+                both[relays.memory[r]] = 0.0
         forward[k], response[k] = both[:, :n], both[:, n:]
     return forward, response

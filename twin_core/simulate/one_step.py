@@ -75,29 +75,41 @@ def one_step(
     for first, last, about_K in anchors(starts_K):
         split = Split.at(network, values, forcing, first, last, about_K)
         more = 0.0 if extra_W is None else (extra_W[first:last] / own)[:, None]
-        stages_K[first:last] = _ends(split, stages_K[first:last], more)
-        balance = balance_along(network, values, forcing, stages_K[first:last], first, last)
+        stages_K[first:last], kicks = take_steps(split, stages_K[first:last], more)
+        balance = balance_along(network, values, forcing, stages_K[first:last], first, last, only=split.steady)
         entries = less_modes(balance.jacobian, split.slope_W_per_K, own)
-        ahead, by_rate = transitions(forcing.step_s[first:last], split.modes, *entries)
+        begins = to_enthalpy_K(network, values, np.ascontiguousarray(starts_K[first:last]))
+        ahead, by_rate = transitions(forcing.step_s[first:last], split.modes, *entries, begins, split.relays, kicks)
         slope = balance.slope.reshape(-1, 2, n_nodes)
         forward[first:last] = slope[:, 1, :, None] * ahead / slope[:, 0, None, :]
         response[first:last] = slope[:, 1, :, None] * by_rate / own
     return Steps(stages_K[:, 1], stages_K, forward, response)
 
 
-def _ends(split: Split, stages_K: FloatArray, more: FloatArray | float) -> FloatArray:
-    """Return the states at both ends of the steps of a stretch, each from its own start; ``more`` adds to the rates."""
+def take_steps(split: Split, stages_K: FloatArray, more: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Return the states at both ends of the steps of a stretch, each from its own start, and what relays did (``march``).
+
+    Parameters
+    ----------
+    split
+        The balance of the stretch.
+    stages_K : (n_steps, 2, n_nodes)
+        The starts, and ends close by.
+    more : (n_steps, 1, n_nodes)
+        Adds to the rates.
+    """
     network, values = split.network, split.values
     lowest, highest = limits(network, values, LIMIT_K)
     step_s = split.forcing.step_s[split.first : split.last]
     stages = to_enthalpy_K(network, values, stages_K)
+    kicks = np.zeros((step_s.size, 0, 0))
     for _ in range(N_NEWTON):
         left, given = split.remainder(split.beside(stages_K, split.first, split.last), stages, split.first, split.last)
         starts = np.ascontiguousarray(stages[:, 0])
-        solved, _ = march(step_s, split.modes, left, given + more, starts, lowest, highest)
+        solved, kicks, _ = march(step_s, split.modes, left, split.relays, given + more, starts, lowest, highest)
         change = float(np.abs(solved - stages).max(initial=0.0))
         stages = solved
         stages_K = to_temperatures_K(network, values, solved, stages_K, LIMIT_K)
         if not split.others or not change >= TOLERANCE_K:
             break
-    return stages_K
+    return stages_K, kicks

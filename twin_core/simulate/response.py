@@ -6,6 +6,7 @@ change of temperature dT counts as dT / (d T / d u), and a parameter of C(T) als
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,9 +15,10 @@ from twin_core.network.dynamics import Balance, free_entries
 from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import Modes, march_sensitivities
+from twin_core.simulate.kernels import N_KICK, Modes, Relays, march_sensitivities
+from twin_core.simulate.one_step import take_steps
 from twin_core.simulate.rollout import Rollout
-from twin_core.simulate.splitting import anchors, couplings, less_modes, modes_of, probe, symmetric, turning
+from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, symmetric, turning
 from twin_core.simulate.stages import balance_along
 
 Entries = tuple[IntArray, IntArray, FloatArray]
@@ -57,22 +59,39 @@ def sensitivities(
         low = int(np.searchsorted(forcing.sample_step, first, side="left" if first == 0 else "right"))
         high = int(np.searchsorted(forcing.sample_step, last, side="right"))
         stages_K, step_s = trajectory.stages_K[first:last], forcing.step_s[first:last]
+        switched = _Switched.along(Split.at(network, values, forcing, first, last, anchor), stages_K)
+        modes = switched.split.modes
         if anchor is not about_K:
             about_K = anchor
-            parts = couplings(network, values, probe(network, values, forcing, about_K))
-            slope = symmetric(parts.slope_W_per_K(about_K))
-            modes = modes_of(slope, own)
-            turned, turns = turning(network, values, forcing, about_K, parts)
+            turned, turns = turning(network, values, forcing, about_K, switched.split.parts)
             turns = modes.inward @ (turns / own[:, None]) @ modes.outward
-        balance = balance_along(network, values, forcing, stages_K, first, last, derivatives=True)
-        entries = balance.entry_free, balance.entry_node, balance.entry_series
+        balance = balance_along(
+            network,
+            values,
+            forcing,
+            stages_K,
+            first,
+            last,
+            derivatives=True,
+            extra_W=switched.heat_W,
+            only=switched.split.steady,
+        )
+        entries = _joined((balance.entry_free, balance.entry_node, balance.entry_series), switched.entries())
         if network.capacities:
             stored = _stored_entries(network, values, stages_K, step_s, begin_K)
-            column, node, series = (np.concatenate(pair) for pair in zip(entries, stored, strict=True))
-            entries = column, node, series
+            entries = _joined(entries, stored)
         samples = forcing.sample_step[low:high] - first
         stages = to_enthalpy_K(network, values, stages_K)
-        split = _Split(modes, slope, turned, turns, stages)
+        split = _Split(
+            modes,
+            switched.split.slope_W_per_K,
+            turned,
+            turns,
+            stages,
+            switched.split.relays,
+            switched.kicks,
+            *switched.columns(),
+        )
         begin_slope = store(network, values, begin_K[None]).slope
         block, state = _march(balance, step_s, split, entries, state, begin_slope, samples, observed)
         yield slice(low, high), block
@@ -88,6 +107,79 @@ class _Split:
     turned: IntArray
     turns: FloatArray
     stages: FloatArray
+    relays: Relays
+    kicks: FloatArray
+    relay_column: IntArray
+    relay_slope: FloatArray
+
+
+@dataclass(frozen=True)
+class _Switched:
+    """What the relays of a stretch did, ``kicks`` (n_steps, n_relays, N_KICK)."""
+
+    split: Split
+    kicks: FloatArray
+
+    @classmethod
+    def along(cls, split: Split, stages_K: FloatArray) -> "_Switched":
+        """Take the steps of a trajectory once more where there are relays."""
+        if not split.parts.relays:
+            return cls(split, np.zeros((stages_K.shape[0], 0, N_KICK)))
+        return cls(split, take_steps(split, stages_K)[1])
+
+    @property
+    def heat_W(self) -> FloatArray | None:
+        """Return the heat at both ends of the steps, (n_steps, 2, n_nodes); None without relays."""
+        if not self.split.parts.relays:
+            return None
+        heat = np.zeros((self.kicks.shape[0], 2, self.split.about_K.size))
+        for r, (_, relay) in enumerate(self.split.parts.relays):
+            heat[:, :, relay.node] += relay.power_W * self.kicks[:, r, :2]
+        return heat
+
+    def _free(self, index: int) -> tuple[int, float]:
+        """Return the position of a parameter among the free ones (-1 where held) and the slope of its transform."""
+        parameters = self.split.network.parameters
+        found = np.flatnonzero(parameters.free_index == index)
+        parameter = parameters.at_values(self.split.values).parameters[index]
+        return (int(found[0]), parameter.transform.slope(parameter.free)) if found.size else (-1, 0.0)
+
+    @cached_property
+    def _powers(self) -> list[tuple[int, float]]:
+        """The free parameters of the relays' powers."""
+        return [self._free(int(self.split.network.term_indices[term][0])) for term, _ in self.split.parts.relays]
+
+    def entries(self) -> "Entries":
+        """Return the derivatives with the powers."""
+        rows = [
+            (column, relay.node, slope * self.kicks[:, r, :2].ravel() / self.split.own_J_per_K[relay.node])
+            for r, ((column, slope), (_, relay)) in enumerate(zip(self._powers, self.split.parts.relays, strict=True))
+            if column >= 0
+        ]
+        return (
+            np.array([column for column, _, _ in rows], dtype=np.int64),
+            np.array([node for _, node, _ in rows], dtype=np.int64),
+            np.array([series for _, _, series in rows]).reshape(len(rows), 2 * self.kicks.shape[0]),
+        )
+
+    def columns(self) -> tuple[IntArray, FloatArray]:
+        """Return which columns thresholds and rates depend on, and how, (4, n_relays) each (``march_sensitivities``)."""
+        split, network = self.split, self.split.network
+        nodes, rate = split.relays.node, split.relays.rate
+        own = split.own_J_per_K[nodes]
+        rows = [
+            [self._free(int(network.term_indices[term][item])) for term, _ in split.parts.relays] for item in (1, 2)
+        ]
+        rows += [self._powers, [self._free(int(network.capacity_index[node])) for node in nodes]]
+        by = [split.thresholds("on_K")[1], split.thresholds("off_K")[1], 1.0 / own, -rate / own]
+        column = np.array([[c for c, _ in row] for row in rows], dtype=np.int64).reshape(4, nodes.size)
+        return column, np.array([[s for _, s in row] for row in rows]).reshape(4, nodes.size) * np.array(by)
+
+
+def _joined(first: "Entries", second: "Entries") -> "Entries":
+    """Return two sets of entries as one."""
+    column, node, series = (np.concatenate(pair) for pair in zip(first, second, strict=True))
+    return column, node, series
 
 
 def heat_response(
@@ -127,6 +219,10 @@ def heat_response(
         nothing,
         np.zeros((0, n_nodes, n_nodes)),
         np.zeros((forcing.n_steps, 2, n_nodes)),
+        Relays(nothing, nothing, *(np.zeros(0) for _ in range(6))),
+        np.zeros((forcing.n_steps, 0, N_KICK)),
+        np.zeros((4, 0), dtype=np.int64),
+        np.zeros((4, 0)),
     )
     begin_slope = np.ones((1, n_nodes))
     block, _ = _march(balance, forcing.step_s, split, entries, still, begin_slope, forcing.sample_step, observed)
@@ -152,6 +248,10 @@ def _march(
         *less_modes(balance.jacobian, split.slope_W_per_K, balance.own_J_per_K),
         split.stages,
         (balance.heat_W / balance.own_J_per_K).reshape(shape),
+        split.relays,
+        split.kicks,
+        split.relay_column,
+        split.relay_slope,
         split.turned,
         split.turns,
         column,

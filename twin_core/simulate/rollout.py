@@ -88,7 +88,7 @@ def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArra
         left, given = split.remainder(None, out, split.first, split.last)
         low, high = limits(split.network, split.values, LIMIT_K)
         step_s = split.forcing.step_s[split.first : split.last]
-        solved, n_solved = march(step_s, split.modes, left, given, start_K[None], low, high)
+        solved, _, n_solved = march(step_s, split.modes, left, split.relays, given, start_K[None], low, high)
         out[:n_solved] = solved[:n_solved]
         return n_solved
     state, done, stretch = start_K, 0, n_steps
@@ -122,7 +122,7 @@ def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: Flo
     change_before, settled, n_inside = np.inf, 0, 0
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
         left, given = split.remainder(split.beside(temperatures, first, last), stages, first, last)
-        solved, n_inside = march(step_s, split.modes, left, given, start[None], lowest, highest)
+        solved, _, n_inside = march(step_s, split.modes, left, split.relays, given, start[None], lowest, highest)
         changes = np.abs(solved - stages).max(axis=(1, 2))
         change = float(changes.max())
         if not np.isfinite(change):
@@ -133,7 +133,7 @@ def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: Flo
         if change * contraction < TOLERANCE_K:
             settled = n_steps
             break
-        # A sharp capacity holds the method up step by step. What else does is a relay's switching, no place to cut at.
+        # A sharp capacity holds the method up step by step.
         settled = int(np.argmax(changes >= TOLERANCE_K)) if network.capacities else 0
         # A step across a kink may swing from one side to the other: half the way ends that.
         stages = 0.5 * (solved + stages) if n_steps == 1 and iteration > 8 else solved

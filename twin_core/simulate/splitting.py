@@ -16,10 +16,10 @@ from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
 from twin_core.network.jacobian import Jacobian
 from twin_core.network.model import Network
-from twin_core.network.storage import to_enthalpy_K
-from twin_core.network.terms import Along
+from twin_core.network.storage import store, to_enthalpy_K
+from twin_core.network.terms import Along, Relay
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import Modes, Remainder
+from twin_core.simulate.kernels import Modes, Relays, Remainder
 
 STRETCH = 1024
 """Steps that are taken together, and after which A is renewed where temperatures have moved."""
@@ -58,6 +58,8 @@ class Couplings:
         heat = linear @ T + fourth @ T⁴ + what is given.
     heat_W : (n_points, n_nodes)
         At the temperatures of the evaluation.
+    relays
+        Positions of terms that a temperature switches, and by what.
     others
         Positions of the remaining terms.
     """
@@ -65,6 +67,7 @@ class Couplings:
     linear_W_per_K: FloatArray
     fourth_W_per_K4: FloatArray
     heat_W: FloatArray
+    relays: tuple[tuple[int, Relay], ...]
     others: tuple[int, ...]
 
     def slope_W_per_K(self, about_K: FloatArray) -> FloatArray:
@@ -76,19 +79,29 @@ def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
     """Return the couplings of a network; ``along`` has two points at least, with one temperature per node."""
     n_points, n = along.temperatures_K.shape
     linear, fourth, heat = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n_points, n))
-    others = []
+    everywhere = tuple(range(n))
+    relays, others = [], []
     for position, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
         part = term.evaluate(along, values[index])
-        block = np.ix_(part.nodes, part.nodes)
-        if part.fourth_W_per_K4 is not None:
-            fourth[block] += part.fourth_W_per_K4
-        elif part.d_temperature.shape[0] == 1:
-            linear[block] += part.d_temperature[0]
-        else:
+        if part.relay is not None:
+            relays.append((position, part.relay))
+            continue
+        if part.fourth_W_per_K4 is None and part.d_temperature.shape[0] > 1:
             others.append(position)
             continue
-        heat[:, part.nodes] += part.heat_W
-    return Couplings(linear, fourth, heat, tuple(others))
+        matrix, slope = (
+            (linear, part.d_temperature[0]) if part.fourth_W_per_K4 is None else (fourth, part.fourth_W_per_K4)
+        )
+        if part.nodes == everywhere:
+            matrix += slope
+            heat += part.heat_W
+        elif len(part.nodes) == 1:  # slices, which cost a fraction of index arrays
+            matrix[part.nodes[0], part.nodes[0]] += slope[0, 0]
+            heat[:, part.nodes[0]] += part.heat_W[:, 0]
+        else:
+            matrix[np.ix_(part.nodes, part.nodes)] += slope
+            heat[:, part.nodes] += part.heat_W
+    return Couplings(linear, fourth, heat, tuple(relays), tuple(others))
 
 
 def probe(network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray) -> Along:
@@ -178,7 +191,40 @@ class Split:
     @property
     def others(self) -> tuple[int, ...]:
         """Terms that must be evaluated along the trajectory: all of them where a capacity changes with temperature."""
-        return tuple(range(len(self.network.terms))) if self.network.capacities else self.parts.others
+        return self.steady if self.network.capacities else self.parts.others
+
+    @cached_property
+    def steady(self) -> tuple[int, ...]:
+        """Positions of all terms that are no relays."""
+        relays = {position for position, _ in self.parts.relays}
+        return tuple(position for position in range(len(self.network.terms)) if position not in relays)
+
+    @cached_property
+    def relays(self) -> Relays:
+        """The relays, their thresholds in enthalpy."""
+        found = [relay for _, relay in self.parts.relays]
+        nodes = np.array([r.node for r in found], dtype=np.int64)
+        low, high = (self.thresholds(name)[0] for name in ("on_K", "off_K"))
+        power = np.array([r.power_W for r in found], dtype=np.float64)
+        return Relays(
+            nodes,
+            np.array([r.memory for r in found], dtype=np.int64),
+            low,
+            high,
+            power / self.own_J_per_K[nodes],
+            np.array([r.off_state_K for r in found], dtype=np.float64),
+            np.array([r.on_state_K for r in found], dtype=np.float64),
+            np.array([r.rate_K_per_s for r in found], dtype=np.float64),
+        )
+
+    def thresholds(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return a threshold of all relays as enthalpy, and its slope with the temperature, (n_relays,) each."""
+        found = [relay for _, relay in self.parts.relays]
+        points = np.tile(self.about_K, (len(found), 1))
+        rows, nodes = np.arange(len(found)), np.array([r.node for r in found], dtype=np.int64)
+        points[rows, nodes] = [getattr(r, name) for r in found]
+        at = store(self.network, self.values, points)
+        return at.enthalpy_K[rows, nodes].astype(np.float64), 1.0 / at.slope[rows, nodes]
 
     @cached_property
     def known(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -257,7 +303,7 @@ def turning(
     along = probe(network, values, forcing, about_K)
     found: dict[int, FloatArray] = {}
     for number, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
-        if number in split.others:
+        if number in split.others or any(number == position for position, _ in split.relays):
             continue
         for item, parameter in enumerate(index.tolist()):
             if parameter not in position:

@@ -1,4 +1,6 @@
-"""The heat balance at the stages of a trajectory."""
+"""The heat balance along a trajectory."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -18,12 +20,15 @@ def balance_along(
     *,
     derivatives: bool = False,
     extra_W: FloatArray | None = None,
+    only: Sequence[int] | None = None,
 ) -> Balance:
-    """Evaluate the heat balance at the stages of steps first..last-1, flattened to (2 n_steps, ...).
+    """Evaluate the heat balance at both ends of steps first..last-1, flattened to (2 n_steps, ...).
 
-    ``extra_W`` (n_steps, n_nodes) is heat beyond the network's terms; a capacity answers to it as to any other.
+    ``extra_W`` (n_steps, n_nodes) or (n_steps, 2, n_nodes) is heat beyond the network's terms; a capacity answers to it as to
+    any other. ``only`` are the positions of the terms that count; all by default.
     """
     boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
     along = forcing.along(stages_K.reshape(-1, stages_K.shape[2]), boundaries, first, last)
-    extra = None if extra_W is None else np.repeat(extra_W, 2, axis=0)
-    return evaluate_balance(network, values, along, derivatives=derivatives, extra_W=extra)
+    if extra_W is not None:
+        extra_W = np.repeat(extra_W, 2, axis=0) if extra_W.ndim == 2 else extra_W.reshape(-1, extra_W.shape[2])
+    return evaluate_balance(network, values, along, derivatives=derivatives, extra_W=extra_W, only=only)

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from twin_core.simulate.kernels import Modes, Remainder, march, march_sensitivities, phi, transitions
+from twin_core.simulate.kernels import N_KICK, Modes, Relays, Remainder, march, march_sensitivities, phi, transitions
 from twin_core.simulate.splitting import modes_of
 
 N, N_STEPS = 4, 12
 LOW, HIGH = np.full(N, -1e9), np.full(N, 1e9)
+NO_RELAYS = Relays(*(np.zeros(0, dtype=np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(6)))
+NO_KICKS = np.zeros((N_STEPS, 0, N_KICK))
 
 
 def coupling(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -41,7 +43,7 @@ def problem(seed: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     return (
         rng.choice([5.0, 20.0, 60.0, 61.3], N_STEPS),
         rng.normal(0.0, 0.1, (N_STEPS, 2, N)),
-        size * rng.normal(0.0, 1e-3, (N, N)),
+        size * (rng.normal(0.0, 1e-3, (N, N)) - 3e-3 * np.eye(N)),
         size * rng.normal(0.0, 1e-3, (N_STEPS, 2, N, N)),
         rng.normal(300.0, 20.0, N),
     )
@@ -60,7 +62,7 @@ def test_march_is_the_exponential_trapezoidal_rule(size: float) -> None:
     slope, capacity = coupling(1)
     step, given, linear, moving, start = problem(2, size)
     modes, a = modes_of(slope, capacity), slope / capacity[:, None]
-    found, bad = march(step, modes, remainder(linear, moving), given, start[None], LOW, HIGH)
+    found, _, bad = march(step, modes, remainder(linear, moving), NO_RELAYS, given, start[None], LOW, HIGH)
     assert bad == N_STEPS
     state = start
     for k in range(N_STEPS):
@@ -77,10 +79,10 @@ def test_steps_from_their_own_starts_are_single_steps() -> None:
     step, given, linear, moving, _ = problem(4, 1.0)
     modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-11)
     starts = np.random.default_rng(5).normal(300.0, 20.0, (N_STEPS, N))
-    found, _ = march(step, modes, left, given, starts, LOW, HIGH)
+    found, _, _ = march(step, modes, left, NO_RELAYS, given, starts, LOW, HIGH)
     for k in range(N_STEPS):
         alone = left._replace(moving=left.moving[k : k + 1])
-        single, _ = march(step[k : k + 1], modes, alone, given[k : k + 1], starts[k : k + 1], LOW, HIGH)
+        single, _, _ = march(step[k : k + 1], modes, alone, NO_RELAYS, given[k : k + 1], starts[k : k + 1], LOW, HIGH)
         np.testing.assert_allclose(found[k], single[0], atol=1e-8)
 
 
@@ -88,9 +90,8 @@ def test_what_leaves_the_limits_is_told() -> None:
     slope, capacity = coupling(6)
     step, given, linear, moving, start = problem(7, 0.0)
     given[5:] += 1e6
-    found, bad = march(
-        step, modes_of(slope, capacity), remainder(linear, moving), given, start[None], LOW, np.full(N, 1e3)
-    )
+    left = remainder(linear, moving)
+    found, _, bad = march(step, modes_of(slope, capacity), left, NO_RELAYS, given, start[None], LOW, np.full(N, 1e3))
     assert bad == 5
     assert np.nanmax(found) <= 1e3
 
@@ -104,7 +105,7 @@ def rolled(x: np.ndarray) -> tuple[np.ndarray, Modes, np.ndarray, Remainder, np.
     step, given, linear, moving, start = problem(9, 1.0)
     given = given + x[2] * np.eye(N)[3]
     modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-10)
-    path, bad = march(step, modes, left, given, (start + x[3] * np.eye(N)[0])[None], LOW, HIGH)
+    path, _, bad = march(step, modes, left, NO_RELAYS, given, (start + x[3] * np.eye(N)[0])[None], LOW, HIGH)
     assert bad == N_STEPS
     return path, modes, slope / capacity[:, None], left, step, given
 
@@ -145,6 +146,10 @@ def test_sensitivities_are_the_derivative_of_the_scheme_that_of_a_included() -> 
         entry,
         path,
         rate,
+        NO_RELAYS,
+        NO_KICKS,
+        np.zeros((4, 0), dtype=np.int64),
+        np.zeros((4, 0)),
         np.array([0, 1]),
         modes.inward @ turns @ modes.outward,
         series_column,
@@ -169,13 +174,13 @@ def test_transitions_are_the_derivative_of_single_steps() -> None:
     modes, left = modes_of(slope, capacity), remainder(linear, moving)
     starts = np.random.default_rng(12).normal(300.0, 20.0, (N_STEPS, N))
     row, column = np.indices((N, N)).reshape(2, -1)
-    forward, response = transitions(step, modes, row, column, left.linear + left.moving)
-    base, _ = march(step, modes, left, given, starts, LOW, HIGH)
+    forward, response = transitions(step, modes, row, column, left.linear + left.moving, starts, NO_RELAYS, NO_KICKS)
+    base, _, _ = march(step, modes, left, NO_RELAYS, given, starts, LOW, HIGH)
     for node in range(N):
         unit = np.eye(N)[node]
-        moved, _ = march(step, modes, left, given, starts + unit, LOW, HIGH)
+        moved, _, _ = march(step, modes, left, NO_RELAYS, given, starts + unit, LOW, HIGH)
         np.testing.assert_allclose(forward[:, :, node], moved[:, 1] - base[:, 1], atol=1e-8)
-        heated, _ = march(step, modes, left, given + unit, starts, LOW, HIGH)
+        heated, _, _ = march(step, modes, left, NO_RELAYS, given + unit, starts, LOW, HIGH)
         np.testing.assert_allclose(response[:, :, node], heated[:, 1] - base[:, 1], atol=1e-8 * 60.0)
 
 
@@ -187,5 +192,5 @@ def test_a_stiff_mode_lands_on_its_target() -> None:
     )
     modes = modes_of(np.array([[-1e12]]), np.ones(1))
     given = np.full((1, 2, 1), 7e12)
-    found, _ = march(np.ones(1), modes, none, given, np.array([[300.0]]), LOW[:1], HIGH[:1])
+    found, _, _ = march(np.ones(1), modes, none, NO_RELAYS, given, np.array([[300.0]]), LOW[:1], HIGH[:1])
     np.testing.assert_allclose(found[0, 1], 7.0, atol=1e-8)
