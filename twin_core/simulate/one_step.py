@@ -7,8 +7,9 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.network.model import Network
 from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
+from twin_core.simulate.derivatives import transitions
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import march, transitions
+from twin_core.simulate.kernels import march
 from twin_core.simulate.rollout import LIMIT_K
 from twin_core.simulate.splitting import Split, anchors, less_modes, limits
 from twin_core.simulate.stages import balance_along

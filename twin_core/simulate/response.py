@@ -14,9 +14,11 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.network.dynamics import Balance, free_entries
 from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
+from twin_core.simulate.derivatives import march_sensitivities
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import N_KICK, Modes, Relays, march_sensitivities
+from twin_core.simulate.modes import Modes
 from twin_core.simulate.one_step import take_steps
+from twin_core.simulate.relays import N_KICK, Relays
 from twin_core.simulate.rollout import Rollout
 from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, symmetric, turning
 from twin_core.simulate.stages import balance_along

@@ -19,7 +19,9 @@ from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.network.terms import Along, Relay
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import Modes, Relays, Remainder
+from twin_core.simulate.kernels import Remainder
+from twin_core.simulate.modes import Modes
+from twin_core.simulate.relays import Relays
 
 STRETCH = 1024
 """Steps that are taken together, and after which A is renewed where temperatures have moved."""

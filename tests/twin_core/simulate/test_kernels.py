@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from twin_core.simulate.kernels import N_KICK, Modes, Relays, Remainder, march, march_sensitivities, phi, transitions
+from twin_core.simulate.derivatives import march_sensitivities, transitions
+from twin_core.simulate.kernels import Remainder, march
+from twin_core.simulate.modes import Modes, phi
+from twin_core.simulate.relays import N_KICK, Relays
 from twin_core.simulate.splitting import modes_of
 
 N, N_STEPS = 4, 12
