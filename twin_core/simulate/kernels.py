@@ -18,7 +18,7 @@ from numba import njit
 from twin_core._typing import FloatArray, IntArray
 from twin_core.simulate.matrices import factorise, multiply, solve_columns
 from twin_core.simulate.modes import Modes, dense, weights
-from twin_core.simulate.relays import N_KICK, Relays, shares_before, switch
+from twin_core.simulate.relays import N_KICK, Relays, is_recalled, shares_before, switch
 
 STEP_K = 1e-10
 """The end of each step is iterated to this, a thousandth of what a rollout converges to."""
