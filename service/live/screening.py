@@ -12,6 +12,7 @@ from service.registry import Entry
 from service.store.samples import Samples
 from service.workbench import Masks, Telemetry
 from twin_core.quality.runs import runs_of
+from twin_core.quality.screen import SENTINEL
 
 CONTEXT = 256
 """So many samples before a block tell what its channels usually do."""
@@ -27,8 +28,10 @@ async def masks_of(twin: Entry, engine: Engine, found: Samples) -> Masks:
     return await engine.screen(twin.units, Telemetry(int(found.time_us[0]), found.time_us, values))
 
 
-async def readings(twin: Entry, engine: Engine, context: Samples | None, fresh: Samples) -> Samples:
-    """Return a block without samples that cannot be readings.
+async def readings(twin: Entry, engine: Engine, context: Samples | None, fresh: Samples) -> tuple[Samples, Samples]:
+    """Return a block without samples that cannot be readings, and one that lacks only the markers of missing ones.
+
+    The filter takes the first; the second shows a detector that a sensor stays away, or is stuck.
 
     Parameters
     ----------
@@ -40,12 +43,15 @@ async def readings(twin: Entry, engine: Engine, context: Samples | None, fresh: 
         The block, all channels.
     """
     whole = fresh if context is None else _joined(context, fresh)
-    values = fresh.values.copy()
+    clean, seen = fresh.values.copy(), fresh.values.copy()
     for name, reasons in (await masks_of(twin, engine, whole)).items():
         row = twin.channels.index(name)
-        for mask in reasons.values():
-            values[row, mask[-fresh.time_us.size :]] = np.nan
-    return Samples(fresh.time_us, values)
+        for reason, mask in reasons.items():
+            in_block = mask[-fresh.time_us.size :]
+            clean[row, in_block] = np.nan
+            if reason == SENTINEL:
+                seen[row, in_block] = np.nan
+    return Samples(fresh.time_us, clean), Samples(fresh.time_us, seen)
 
 
 def told(found: Samples, masks: Masks, names: Sequence[str], since_us: int) -> dict[str, list[Json]]:

@@ -183,7 +183,7 @@ class Tracker:
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
         try:
-            clean = await self._readings(fresh, before)
+            clean, seen = await self._readings(fresh, before)
             telemetry, held = stretch(self.twin, clean, active.epoch_us, before)
             done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
         except Exception as error:  # whatever it is, it would come again with the same samples
@@ -196,11 +196,11 @@ class Tracker:
         caution.succeeded()
         self.trouble = None
         seq = before.seq if before is not None and reading.late_us is not None else reading.seq
-        await self._keep(active, before, fresh, done, held, seq, reading.told)
+        await self._keep(active, before, seen, done, held, seq, reading.told)
         return True
 
-    async def _readings(self, fresh: Samples, before: Position | None) -> Samples:
-        """Return a block without what the samples before it show to be no readings."""
+    async def _readings(self, fresh: Samples, before: Position | None) -> tuple[Samples, Samples]:
+        """Return a block without what the samples before it show to be no readings, and without missing ones alone."""
         context = None
         if before is not None:
             n = len(self.twin.channels)

@@ -95,6 +95,16 @@ def test_a_marker_that_comes_live_is_masked_with_what_came_before_it(client: App
     assert [span["reason"] for span in found["masked"].get("T_tank", [])] == ["sentinel"]
 
 
+def test_a_sensor_that_only_sends_markers_is_missed(client: AppClient) -> None:
+    values = telemetry(400)
+    values["T_tank"][300:] = [-999.0] * 100
+    send(client, values, 0, 400)
+    activate(client)
+    client.get(f"{TWIN}/residuals")
+    found = client.get(f"{TWIN}/anomalies").json()["anomalies"]
+    assert {(row["sensor"], row["kind"]) for row in found} == {("T_tank", "dropout")}
+
+
 def test_what_no_instrument_reads_and_nobody_writes_for_missing_is_refused(client: AppClient) -> None:
     body = {"time": [0.0], "values": {"T_tank": [-998.0]}}
     answer = client.post(f"{TWIN}/telemetry", json=body)

@@ -13,25 +13,10 @@ LEAST_READINGS = 16
 COLDEST_K = 1.0
 """No thermometer of a spacecraft reads less: 0 K is a missing value, however long it lasts."""
 
-MARKERS = (
-    -32768.0,
-    -9999.0,
-    -999.9,
-    -999.0,
-    -127.0,
-    85.0,
-    255.0,
-    999.0,
-    999.9,
-    4095.0,
-    9999.0,
-    32767.0,
-    65535.0,
-    99999.0,
-)
-"""Numbers that loggers write for 'missing', in a channel's own unit: strings of nines, full-scale integers of 8 to 16 bits,
-and the -127 and 85 degC of digital thermometers that are not there or not ready. A number counts as a marker only where the
-readings leap to it and back as they never do elsewhere."""
+MARKERS = (-32768.0, -9999.0, -999.9, -999.0, 9999.0, 32767.0, 65535.0, 99999.0)
+"""Numbers that loggers write for 'missing', in a channel's own unit: strings of nines, full-scale integers of 16 bits. A
+number counts as a marker only where the readings leap to it and back as they never do elsewhere."""
 
-MISSING_TEMPERATURE = 0.0
-"""What else is written for a missing temperature."""
+TEMPERATURE_MARKERS = (*MARKERS, -127.0, 0.0, 85.0, 999.0, 999.9, 4095.0)
+"""Of temperatures also zero, and the -127 and 85 degC of digital thermometers that are not there or not ready. A heater may
+well be switched on once, at 85 W."""

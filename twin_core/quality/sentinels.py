@@ -4,7 +4,7 @@ import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.constants import ZERO_CELSIUS_K
-from twin_core.quality.policy import COLDEST_K, LEAST_READINGS, MARKERS, MISSING_TEMPERATURE
+from twin_core.quality.policy import COLDEST_K, LEAST_READINGS, MARKERS, TEMPERATURE_MARKERS
 from twin_core.quality.runs import runs_of
 from twin_core.quality.spikes import largest_step
 
@@ -23,7 +23,7 @@ def marked(values: FloatArray, unit: str | None) -> BoolArray:
         The channel's own unit, in which the marker was written.
     """
     own = values - ZERO_CELSIUS_K if unit == "degC" else values
-    markers = (*MARKERS, MISSING_TEMPERATURE) if unit in ("K", "degC") else MARKERS
+    markers = TEMPERATURE_MARKERS if unit in ("K", "degC") else MARKERS
     found = np.zeros(values.size, dtype=np.bool_)
     for marker in markers:
         found |= np.abs(own - marker) < 1e-6

@@ -107,6 +107,25 @@ def test_numbers_that_mean_missing(channel: str, own: float, at: list[int]) -> N
     np.testing.assert_array_equal(np.flatnonzero(masks[channel]["sentinel"]), at)
 
 
+@pytest.mark.parametrize("power_W", [0.0, 85.0, 127.0, 255.0, 999.0, 4095.0])
+def test_a_heater_may_be_switched_on_once(power_W: float) -> None:
+    columns = healthy(4)
+    columns["Q"] = np.where((np.arange(1200) > 400) & (np.arange(1200) < 500), power_W, 20.0)
+    assert found(columns) == {}
+
+
+def test_a_sensor_that_dies_is_frozen_to_the_end() -> None:
+    columns = healthy(6)
+    columns["T_c"][1101:] = columns["T_c"][1100]
+    assert {name: set(reasons) for name, reasons in found(columns).items()} == {"T_c": {"frozen"}}
+    np.testing.assert_array_equal(np.flatnonzero(found(columns)["T_c"]["frozen"]), np.arange(1101, 1200))
+
+
+def test_a_channel_that_is_written_more_often_than_it_is_read_is_not_frozen() -> None:
+    columns = {name: np.repeat(column[:300], 6) for name, column in healthy(7).items()}
+    assert found(columns) == {}
+
+
 def test_a_zero_that_is_a_temperature_stays() -> None:
     """Through the freezing point, and along it."""
     columns = {"T_b": np.round(np.random.default_rng(0).normal(0.0, 0.4, 800), 1) + 273.15}
