@@ -26,12 +26,12 @@ def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
 def screened(spec: TwinSpec, record: Record) -> Record:
     """Return a record with what cannot be readings missing, and notices that say so, and what in it is most likely a mistake.
 
-    Excluded samples stay as they are.
+    Excluded readings stay as they are; inputs are looked at there too, for they drive what comes after.
 
     Channels of the orbit are computed and need no screening; a record that was looked at before is returned as it is.
     """
     if record.flaws is not None:
         return record
     units = {name: channel.unit for name, channel in spec.channels.items()}
-    clean = masked(record, units, excluded(record, spec.exclude))
+    clean = masked(record, units, dict.fromkeys(spec.sensors, excluded(record, spec.exclude)))
     return replace(clean, notices=tuple(dict.fromkeys([*clean.notices, *doubts(spec, clean)])))

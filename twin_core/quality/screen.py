@@ -28,12 +28,12 @@ class Screening:
 
     masks: Mapping[str, Mapping[str, BoolArray]]
 
-    def without(self, keep_out: BoolArray) -> "Screening":
-        """Return the screening with nothing to say about some samples, (n_times,)."""
-        masks = {
-            channel: {reason: mask & ~keep_out for reason, mask in reasons.items() if (mask & ~keep_out).any()}
-            for channel, reasons in self.masks.items()
-        }
+    def without(self, ignored: Mapping[str, BoolArray]) -> "Screening":
+        """Return the screening with nothing to say about some samples of some channels, (n_times,) each."""
+        masks: dict[str, dict[str, BoolArray]] = {}
+        for channel, reasons in self.masks.items():
+            heard = ~ignored[channel] if channel in ignored else np.True_
+            masks[channel] = {reason: mask & heard for reason, mask in reasons.items() if (mask & heard).any()}
         return Screening({channel: reasons for channel, reasons in masks.items() if reasons})
 
     def reason_at(self, channel: str, row: int) -> str | None:
@@ -92,7 +92,7 @@ def _at_an_extreme(column: FloatArray, frozen: BoolArray) -> BoolArray:
     return railed
 
 
-def masked(record: Record, units: Mapping[str, str | None], ignored: BoolArray | None = None) -> Record:
+def masked(record: Record, units: Mapping[str, str | None], ignored: Mapping[str, BoolArray] | None = None) -> Record:
     """Return a record without samples that cannot be readings: they are missing, and its notices say so.
 
     A record that was looked at before is returned as it is.
@@ -103,7 +103,7 @@ def masked(record: Record, units: Mapping[str, str | None], ignored: BoolArray |
         In SI.
     units : channel -> unit
         As :func:`screen` takes them.
-    ignored : (n_times,)
+    ignored : channel -> (n_times,)
         Samples that take no part in anything: they are left as they are.
     """
     if record.flaws is not None:

@@ -149,6 +149,8 @@ def _end_spikes(time_s: FloatArray, values: FloatArray) -> BoolArray:
             others = values[rest]
             span = float(np.ptp(others))
             off = np.abs(values[ends] - np.clip(values[ends], np.min(others), np.max(others)))
+            if float(off.min()) <= span:
+                continue
             bound = largest_step(time_s[rest], others)
             if float(off.min()) > span + bound and np.ptp(values[ends]) <= bound:
                 found[ends] = True

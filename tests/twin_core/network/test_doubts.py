@@ -64,3 +64,12 @@ def test_an_isolated_node_is_told() -> None:
     data["nodes"] = [*data["nodes"], {"id": "lost", "capacity_J_per_K": {"guess": 5.0}}]
     (said,) = doubts(load_spec(data), telemetry())
     assert said.startswith("node 'lost' has no coupling and no load")
+
+
+def test_inputs_are_screened_in_excluded_intervals_too() -> None:
+    data = declared().model_dump(exclude_none=True) | {"exclude": [{"start": 6000.0, "stop": 9000.0, "reason": "test"}]}
+    record = telemetry()
+    record.values["T_a"][120], record.values["Q"][130] = 0.0, -9999.0
+    clean = screened(load_spec(data), record)
+    assert clean.values["T_a"][120] == 0.0 and np.isnan(clean.values["Q"][130])
+    assert [(flaw.channel, flaw.reason) for flaw in clean.flaws or ()] == [("Q", "sentinel")]
