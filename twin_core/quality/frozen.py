@@ -61,21 +61,22 @@ def frozen_channel(column: FloatArray) -> BoolArray:
         return found
     same = values[1:] == values[:-1]
     first, stop = runs_of(same)
-    stay = np.maximum.reduce(
-        [np.full(first.size, same.mean()), _stay(values, first, stop), _sticky(values, first, stop)]
-    )
+    stay = np.maximum(same.mean(), _stay(values, first, stop))
+    doubtful = _unlikely(stop - first, np.full(first.size, same.mean()), 1)
+    stay = np.maximum(stay, _sticky(values, first, stop, doubtful))
     of_present = np.zeros(at.size, dtype=np.bool_)
     _mark(of_present, first, stop, _unlikely(stop - first, stay, at.size))
     found[at[of_present]] = True
     return found
 
 
-def _sticky(values: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
+def _sticky(values: FloatArray, first: IntArray, stop: IntArray, doubtful: BoolArray) -> FloatArray:
     """Return how probable a repeat is as the other runs at the same value tell it, (n_runs,).
 
     Some codes of a converter are far wider than others: what stays long at one value again and again is no freeze. The
     longest of n runs has about log(n + 1) times the mean length, so it tells the probability, whatever the short ones do.
-    At the ends of the range it may be a rail, which repeats too.
+    Only another run says so that, taken alone, is longer than the record's share of repeats explains. At the ends of the range it
+    may be a rail, which repeats too.
     """
     length = (stop - first).astype(np.float64)
     _, code = np.unique(values[first], return_inverse=True)
@@ -88,7 +89,11 @@ def _sticky(values: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
     is_longest = np.zeros(first.size, dtype=np.bool_)
     is_longest[order[last]] = True
     rival = np.where(is_longest, second[code], longest[code])
-    inner = (values[first] > values.min()) & (values[first] < values.max()) & (rival > 0.0)
+    inner = (
+        (values[first] > values.min())
+        & (values[first] < values.max())
+        & (np.bincount(code, doubtful)[code] - doubtful > 0.0)
+    )
     return np.where(inner, np.exp(-np.log(others[code] + 1.0) / np.maximum(rival, 1.0)), 0.0)
 
 
