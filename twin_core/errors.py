@@ -17,5 +17,9 @@ class ModelError(TwinError):
     """A request that the network or the model cannot answer, such as a node that does not exist."""
 
 
+class NoSolutionError(ModelError):
+    """The declared model has no solution from any start: the command line shows it in one line and exits with 1."""
+
+
 class Cancelled(TwinError):
     """A long job was asked to stop."""

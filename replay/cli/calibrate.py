@@ -1,5 +1,7 @@
 """``twin calibrate``: fits the declared network to telemetry."""
 
+import time
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +27,23 @@ from replay.cli.command import FILE, Command
 @click.option("--method", default="second-order", show_default=True, help="How to fit; docs/cli.md lists the methods.")
 @click.option("--loss", default="squared", show_default=True, help="squared, or huber for readings with outliers.")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
+@click.option(
+    "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."
+)
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def calibrate(
-    spec_file: Path, telemetry: tuple[Path, ...], method: str, loss: str, no_masking: bool, out: Path, as_json: bool
+    spec_file: Path,
+    telemetry: tuple[Path, ...],
+    method: str,
+    loss: str,
+    no_masking: bool,
+    deadline: float | None,
+    out: Path,
+    as_json: bool,
 ) -> None:
     """Calibrate the declared network against telemetry, with the uncertainty of every parameter."""
+    stop = inf if deadline is None else time.monotonic() + deadline
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.recordings import check_suffix, load_records
     from twin_core.calibrate import calibrate as fit
@@ -41,7 +54,7 @@ def calibrate(
     spec = load_spec(spec_file)
     records = load_records(telemetry, spec, masking=not no_masking)
     with progress_bar("calibrating") as progress:
-        model = fit(spec, records, method=method, loss=loss, progress=progress)
+        model = fit(spec, records, method=method, loss=loss, deadline=stop, progress=progress)
     write_text(out, to_json(model.to_json()))
     notify(model.summary["notices"])
     if as_json:
@@ -60,6 +73,8 @@ def _print_summary(summary: dict[str, Any], out: Path) -> None:
     print_table("calibrated parameters", ["parameter", "mean", "std", "unit"], parameters)
     sensors = [[name, short(row["rmse_K"]), short(row["bias_K"], 2)] for name, row in summary["per_sensor"].items()]
     print_table("training misfit", ["sensor", "rmse K", "bias K"], sensors)
+    if summary["status"] != "converged":
+        print_line(summary["advice"])
     for words in summary.get("words", ()):
         print_line(words)
     print_line(f"wrote {out}")

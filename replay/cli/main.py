@@ -19,9 +19,9 @@ from replay.cli.serve import serve
 from replay.cli.simulate import simulate
 from replay.errors import ReplayError
 from twin_core import __version__
-from twin_core.errors import TwinError
+from twin_core.errors import NoSolutionError, TwinError
 
-BAD_INPUT, INTERNAL, INTERRUPTED = 2, 70, 130
+ANSWER_IS_NO, BAD_INPUT, INTERNAL, INTERRUPTED = 1, 2, 70, 130
 
 
 @click.group(
@@ -64,6 +64,8 @@ def _explain(error: Exception) -> int:
         return _say(f"{error.format_message().rstrip('.')}; see {command} --help", BAD_INPUT)
     if isinstance(error, click.ClickException):
         return _say(error.format_message(), BAD_INPUT)
+    if isinstance(error, NoSolutionError):
+        return _say(str(error), ANSWER_IS_NO)
     if isinstance(error, TwinError | ReplayError):
         return _say(str(error), BAD_INPUT)
     return _say(

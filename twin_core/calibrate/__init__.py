@@ -21,6 +21,7 @@ def calibrate(
     *,
     method: str = "second-order",
     loss: str = "squared",
+    deadline: float = float("inf"),
     progress: Progress = no_progress,
 ) -> CalibratedModel:
     """Calibrate a declared network against telemetry.
@@ -36,6 +37,9 @@ def calibrate(
         (arXiv 2605.28452), Adam on windows of the record; it states no uncertainty of the parameters.
     loss
         ``squared``, or ``huber`` for readings with outliers; the second method knows ``squared`` only.
+    deadline
+        On the clock of ``time.monotonic``: the second-order search ends there with the best so far; the summary's
+        ``status`` is then ``deadline``. It holds for that method alone.
     progress
         Called with the fraction done and a message.
 
@@ -47,27 +51,34 @@ def calibrate(
     Raises
     ------
     TelemetryError, ModelError
-        If the telemetry lacks what the model needs, or the balance has no solution.
+        If the telemetry lacks what the model needs.
+    NoSolutionError
+        If the heat balance has no solution from any start.
     """
     if method not in METHODS:
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
     if loss not in LOSSES:
         raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
     records = cut_at_gaps(records, spec.driving_channels)
-    from twin_core.calibrate.second_order import fit_trajectories, to_model
-
     if method == "neural-ode":
-        if loss != "squared":
-            raise ModelError(f"method '{method}' knows the squared loss only; use second-order with '{loss}'")
-        from twin_core.calibrate.neural_ode import fit_neural_ode
-
-        _, calibration = fit_neural_ode(spec, records, progress=progress)
-        model = to_model(calibration, (), uncertain=False)
+        model = _by_neural_ode(spec, records, loss, progress)
     else:
-        calibration = fit_trajectories(spec, records, loss="huber" if loss == "huber" else "squared", progress=progress)
-        model = to_model(calibration, ())
+        from twin_core.calibrate.explained import calibrate_and_explain
+
+        model = calibrate_and_explain(spec, records, "huber" if loss == "huber" else "squared", deadline, progress)
     progress(1.0, "calibrated")
     return model
+
+
+def _by_neural_ode(spec: TwinSpec, records: Sequence[Record], loss: str, progress: Progress) -> CalibratedModel:
+    """Calibrate by the method of paper A."""
+    if loss != "squared":
+        raise ModelError(f"method 'neural-ode' knows the squared loss only; use second-order with '{loss}'")
+    from twin_core.calibrate.neural_ode import fit_neural_ode
+    from twin_core.calibrate.second_order import to_model
+
+    _, calibration = fit_neural_ode(spec, records, progress=progress)
+    return to_model(calibration, (), uncertain=False)
 
 
 __all__ = ["LOSSES", "METHODS", "CalibratedModel", "calibrate"]

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
+from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Fit, Problem, build_problem
 from twin_core.network.spec import TwinSpec
@@ -45,6 +46,7 @@ def approach(
     tolerance: float = TOLERANCE,
     rounds: int = MAX_ROUNDS,
     stands_for: float = 1.0,
+    deadline: float = NO_DEADLINE,
 ) -> Optimum:
     """Return an optimum in which noise and misfit are weighed together.
 
@@ -60,6 +62,8 @@ def approach(
         Rounds at most.
     stands_for
         Readings of the full record that each one of a thinned record stands for, beside priors that stand for themselves.
+    deadline
+        On the clock of ``time.monotonic``: the search ends there, with what it has.
 
     Returns
     -------
@@ -76,15 +80,19 @@ def approach(
     for _ in range(rounds):
         noise = np.hypot(problem.noise_K, CAUTION * before) / np.sqrt(stands_for)
         weighed = replace(problem, noise_K=noise)
-        best = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance)
-        x, fit, iterations = best.unknowns, best.fit, iterations + best.iterations
+        found = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance, deadline=deadline)
+        if found.status == "no_solution":
+            break
+        best, x, fit, iterations = found, found.unknowns, found.fit, iterations + found.iterations
         after = misfit_K(problem, fit)
-        if after > SETTLED * before:
+        if after > SETTLED * before or best.status == "deadline":
             break
         before = after
     if (CAUTION * misfit_K(problem, fit) < problem.noise_K).all():
-        best = minimise(problem, x, near=fit)
-    return replace(best, iterations=iterations + best.iterations)
+        found = minimise(problem, x, near=fit, deadline=deadline)
+        if found.status != "no_solution":
+            best, iterations = found, iterations + found.iterations
+    return replace(best, iterations=iterations)
 
 
 def coarse_problem(problem: Problem, step_s: float) -> Problem:

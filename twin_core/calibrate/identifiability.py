@@ -1,12 +1,14 @@
 """Which parameters the data can see, in numbers and in words."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.network.spec import TwinSpec
+from twin_core.parameters.parameter import Parameter
 from twin_core.parameters.transforms import Identity, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
 from twin_core.telemetry import Record
@@ -19,6 +21,12 @@ LITTLE_LEARNED = 0.9
 
 IDENTIFIED_STD = 1.0 / 3.0
 """A parameter whose relative standard deviation is below this is identified: signal-to-noise ratio of at least 3."""
+
+NEAR = 1.5
+"""A parameter within this factor of its guess is said to stay near it."""
+
+FAR = 10.0
+"""Beyond this factor a guess was no guess of the same thing: a prior of a factor e puts less than 3 % there."""
 
 TOGETHER = 0.5
 """Parameters of a weak direction are told together where their estimates are correlated by more than this."""
@@ -87,12 +95,59 @@ def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str |
     return f"the data tell {' and '.join(names)} only together: they may move by a factor {factor:.3g} as one"
 
 
-def words(parameters: ParameterSet, covariance: FloatArray) -> list[str]:
-    """Return plain statements about what the data cannot see; empty where they see everything."""
+def words(
+    parameters: ParameterSet, covariance: FloatArray, guesses: Mapping[str, float] = MappingProxyType({})
+) -> list[str]:
+    """Return plain statements about what the data cannot see, and how far from its guess each such parameter went.
+
+    Parameters
+    ----------
+    parameters
+        The calibrated set.
+    covariance : (n_free, n_free)
+        In the solver's coordinate.
+    guesses
+        Name -> guess that was stated.
+    """
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    said = [f"the data do not determine {name}; it stays near its guess" for name in unseen_parameters(parameters, std)]
+    by_name = {p.name: p for p in parameters.parameters}
+    unseen = unseen_parameters(parameters, std)
+    said = [f"the data do not determine {name}; {_whereabouts(by_name[name], guesses.get(name))}" for name in unseen]
     direction = weakest_direction(parameters, covariance)
     return said + ([direction] if direction else [])
+
+
+def distance(parameter: Parameter, guess: float) -> float:
+    """Return how far a parameter went from its guess: the factor (at least 1), or for one of either sign the difference."""
+    if not is_logarithmic(parameter.transform):
+        return abs(parameter.value - guess)
+    return float(np.exp(min(abs(np.log(parameter.value / guess)), 700.0)))
+
+
+def gone_far(parameters: ParameterSet, guesses: Mapping[str, float]) -> list[Parameter]:
+    """Return the free positive parameters that ended beyond a factor :data:`FAR` of their stated guess, farthest first."""
+    free = [parameters.parameters[i] for i in parameters.free_index]
+    told = [p for p in free if p.name in guesses and is_logarithmic(p.transform)]
+    far = [p for p in told if distance(p, guesses[p.name]) > FAR]
+    return sorted(far, key=lambda p: -distance(p, guesses[p.name]))
+
+
+def how_far(parameter: Parameter, guess: float) -> str:
+    """Return in words how far a parameter went from its guess."""
+    size, unit = distance(parameter, guess), f" {parameter.unit}".rstrip()
+    way = "above" if parameter.value > guess else "below"
+    if is_logarithmic(parameter.transform):
+        return f"{size:.3g} times {way} its guess of {guess:.3g}{unit}"
+    return f"{size:.3g}{unit} {way} its guess of {guess:.3g}{unit}"
+
+
+def _whereabouts(parameter: Parameter, guess: float | None) -> str:
+    if guess is None:
+        return f"nobody guessed it, and {parameter.value:.3g} {parameter.unit}".rstrip() + " is one value of many"
+    near = NEAR if is_logarithmic(parameter.transform) else 0.1 * abs(guess)
+    if distance(parameter, guess) <= near:
+        return "it stays near its guess"
+    return f"it ended {how_far(parameter, guess)}"
 
 
 def strong_correlations(

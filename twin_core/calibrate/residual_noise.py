@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
 from twin_core.gp.noise_model import ResidualNoise, fit
@@ -59,10 +60,18 @@ def fit_whitener(problem: Problem, residuals: Sequence[FloatArray]) -> Whitener:
     Quantisation and the sensors' white noise are a floor: a residual cannot be whiter than its sensor.
     """
     time_s, stacked = one_axis(problem), np.concatenate(list(residuals))
-    models = tuple(
-        fit(time_s, stacked[:, s], white_floor=0.7 * float(problem.noise_K[s])) for s in range(stacked.shape[1])
-    )
+    models = tuple(_fitted(time_s, stacked[:, s], 0.7 * float(problem.noise_K[s])) for s in range(stacked.shape[1]))
     return Whitener(time_s, np.isfinite(stacked), models)
+
+
+def _fitted(time_s: FloatArray, residual: FloatArray, floor_K: float) -> ResidualNoise:
+    """Return the noise of one sensor; white noise as large as what is left where the fit of a coloured one fails."""
+    found = attempted(lambda: fit(time_s, residual, white_floor=floor_K), "residual noise", [])
+    if found is not None:
+        return found
+    seen = residual[np.isfinite(residual)]
+    sigma_K = max(float(np.sqrt(np.mean(seen**2))), floor_K)
+    return ResidualNoise(0.0, float(np.median(np.diff(time_s))), sigma_K, -np.inf)
 
 
 def stacked_jacobian(problem: Problem, blocks: Sequence[FloatArray]) -> FloatArray:

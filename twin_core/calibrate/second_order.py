@@ -2,16 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
+from twin_core.calibrate.containment import NO_DEADLINE, attempted
 from twin_core.calibrate.covariance import is_open_ended, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit
+from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem
@@ -20,7 +23,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.effects.base import Effect
-from twin_core.errors import ModelError, TelemetryError
+from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
@@ -31,7 +34,8 @@ from twin_core.telemetry import Record
 STEP_ERROR_SHARE = 0.1
 """Time steps are halved until halving changes no reading by more than this share of the noise."""
 
-NO_COVARIANCE = "this method states no uncertainty of the parameters; forecasts carry only that of state and misfit"
+NO_COVARIANCE = "no uncertainty of the parameters is stated; forecasts carry only that of state and misfit"
+NO_UNCERTAINTY = "the uncertainty of the parameters could not be computed"
 
 STEP_ERROR_FLOOR_K = 1e-3
 """No step is halved for less: no sensor resolves it."""
@@ -45,7 +49,6 @@ READINGS_PER_UNKNOWN = 2
 """Fewer are refused: any model passes through as many readings as it has unknowns."""
 
 MAX_HALVINGS = 3
-N_STARTS = 4
 
 
 @dataclass(frozen=True)
@@ -112,7 +115,8 @@ def prepare(
     problem = problem.with_network(network.with_parameters(balance_start(problem)))
     for _ in range(MAX_HALVINGS):
         finer = build_problem(problem.network, records, noise, step / 2.0)
-        if _step_error(problem, finer) < STEP_ERROR_SHARE:
+        error = attempted(partial(_step_error, problem, finer), "time step", [])
+        if error is None or error < STEP_ERROR_SHARE:
             break
         step, problem = step / 2.0, finer
     return replace(problem, huber=HUBER if loss == "huber" else np.inf), step
@@ -139,36 +143,56 @@ def fit_network(
     ------
     TelemetryError
         If the telemetry cannot be used.
-    ModelError
+    NoSolutionError
         If the heat balance has no solution at any start.
     """
     progress(0.0, "reading noise and levels")
     problem, step = prepare(spec, records, effects)
-    progress(0.1, "fitting in the presence of latent heat")
-    fit = fit_with_latent_heat(problem)
-    progress(0.4, "fitting open-loop trajectories")
-    optimum = _best_start(fit, progress)
-    if optimum.status == "no_solution":
-        raise ModelError(f"calibration failed: {ADVICE[optimum.status]}")
+    progress(0.1, "fitting open-loop trajectories")
+    failures: list[str] = []
+    coarse = coarse_problem(problem, step)
+    search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples)
+    problem = recentred(problem, search.best)
+    found = [attempted(partial(minimise, problem, search.best.unknowns), "open-loop trajectories", failures)]
+    progress(0.4, "fitting in the presence of latent heat")
+    fits = [attempted(partial(fit_with_latent_heat, problem), "latent heat", failures)]
+    found += [
+        attempted(partial(minimise, problem, f.unknowns()), "open-loop trajectories", failures) for f in fits if f
+    ]
+    optima = [o for o in found if o is not None and o.status != "no_solution"]
+    if not optima:
+        raise NoSolutionError(f"calibration failed: {'; '.join(failures) or ADVICE['no_solution']}")
+    optimum = min(optima, key=lambda o: o.fit.cost)
     progress(0.8, "fitting again in the presence of latent heat")
-    again = fit_with_latent_heat(problem, optimum.unknowns[: problem.n_free], leashes=(np.inf,) * 3)
-    fit = max(fit, again, key=lambda f: f.log_posterior)
+    free, leashes = optimum.unknowns[: problem.n_free], (np.inf,) * 3
+    fits.append(attempted(partial(fit_with_latent_heat, problem, free, leashes=leashes), "latent heat", failures))
+    heat_fits = [f for f in fits if f is not None]
+    if not heat_fits:
+        raise NoSolutionError(f"calibration failed: {'; '.join(failures)}: check the units of loads and known values")
     progress(0.95, "weighing what is left")
-    return fit, Calibration(problem, optimum, fit_whitener(problem, problem.residuals(optimum.fit)), step)
+    whitener = fit_whitener(problem, problem.residuals(optimum.fit))
+    return max(heat_fits, key=lambda f: f.log_posterior), Calibration(problem, optimum, whitener, step)
 
 
 def fit_trajectories(
-    spec: TwinSpec, records: Sequence[Record], *, loss: Loss = "squared", progress: Progress = no_progress
+    spec: TwinSpec,
+    records: Sequence[Record],
+    *,
+    loss: Loss = "squared",
+    deadline: float = NO_DEADLINE,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Calibrate a declared network by trajectories alone (paper A, eq. 2).
 
-    Starts from the guesses, and where some are missing from several places about what the heat balance tells; on a
-    thinned record first, where it is long.
+    Starts from the guesses, and where some are missing or no start has a solution there from several places about what
+    the heat balance tells; on a thinned record first, where it is long.
 
     Parameters
     ----------
     spec, records, loss
         As in :func:`prepare`.
+    deadline
+        On the clock of ``time.monotonic``: the search ends there with the best so far, whose status says so.
     progress
         Called with the fraction done.
 
@@ -176,39 +200,41 @@ def fit_trajectories(
     ------
     TelemetryError
         If the telemetry cannot be used.
-    ModelError
+    NoSolutionError
         If the heat balance has no solution at any start.
     """
     progress(0.0, "reading noise and levels")
     problem, step_s = prepare(spec, records, loss=loss)
     coarse = coarse_problem(problem, step_s)
-    starts = [problem.start(), *_scattered(problem, problem.start())]
-    found = []
-    for trial, start in enumerate(starts):
-        progress(0.1 + 0.5 * trial / len(starts), "fitting trajectories")
-        found.append(approach(coarse, start, stands_for=problem.n_samples / coarse.n_samples))
+    search = best_of_starts(
+        coarse,
+        stands_for=problem.n_samples / coarse.n_samples,
+        deadline=deadline,
+        progress=lambda share, message: progress(0.1 + 0.5 * share, message),
+    )
+    best, problem = search.best, recentred(problem, search.best)
     progress(0.6, "fitting all samples")
-    best = min(found, key=lambda o: coarse.solve(o.unknowns, o.fit).cost)
-    if coarse is not problem and best.status != "no_solution":
-        fine = approach(problem, best.unknowns, rounds=1)
-        best = replace(fine, iterations=best.iterations + fine.iterations)
-    if best.status == "no_solution":
-        raise ModelError(f"calibration failed: {ADVICE[best.status]}")
+    failures: list[str] = []
+    fine = attempted(partial(approach, problem, best.unknowns, rounds=1, deadline=deadline), "refinement", failures)
+    if fine is None or fine.status == "no_solution":
+        fine = minimise(problem, best.unknowns, max_iterations=0)
+    if fine.status == "no_solution":
+        raise NoSolutionError(f"calibration failed: {'; '.join(failures) or ADVICE[fine.status]}")
+    late = not search.complete or "deadline" in (best.status, fine.status)
+    status = "deadline" if late else fine.status
+    best = replace(fine, iterations=best.iterations + fine.iterations, status=status)
     progress(0.9, "weighing what is left")
     return Calibration(problem, best, fit_whitener(problem, problem.residuals(best.fit)), step_s)
 
 
-def _scattered(problem: Problem, unknowns: FloatArray) -> list[FloatArray]:
-    """Return further starts, in which the parameters that nobody guessed are scattered by a factor e."""
-    parameters = problem.network.parameters
-    guessed = np.flatnonzero([parameters.parameters[i].guessed for i in parameters.free_index])
-    generator = np.random.default_rng(0)
-    starts = []
-    for _ in range(1, N_STARTS if guessed.size else 1):
-        scattered = unknowns.copy()
-        scattered[guessed] += generator.normal(0.0, 1.0, guessed.size)
-        starts.append(scattered)
-    return starts
+def recentred(problem: Problem, optimum: Optimum) -> Problem:
+    """Return the problem with the flat priors of what nobody guessed about where it was found.
+
+    They have no centre of their own. About a first look they would pull the scale that the stated guesses set.
+    """
+    parameters, found = problem.network.parameters, problem.values(optimum.unknowns)
+    guessed = np.array([p.guessed for p in parameters.parameters])
+    return problem.with_network(problem.network.with_values(np.where(guessed, found, parameters.values)))
 
 
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
@@ -234,26 +260,15 @@ def _step_error(problem: Problem, finer: Problem) -> float:
     return worst
 
 
-def _best_start(fit: HeatFit, progress: Progress) -> Optimum:
-    """Return the best optimum from the heat fit, from the declared guesses, and where those are missing from others."""
-    problem = fit.problem
-    near = minimise(problem, approach(problem).unknowns)
-    best = min(minimise(problem, fit.unknowns()), near, key=lambda o: o.fit.cost)
-    for trial, scattered in enumerate(_scattered(problem, fit.unknowns()), start=1):
-        progress(0.4 + 0.15 * trial, "fitting from other starting points")
-        best = min(best, minimise(problem, scattered, max_iterations=40), key=lambda o: o.fit.cost)
-    return best
-
-
 def to_model(
     calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
 ) -> CalibratedModel:
     """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told."""
-    problem, optimum = calibration.problem, calibration.optimum
+    problem = calibration.problem
     network, spec = calibration.network, calibration.network.spec
-    free = None
+    free, failures = None, list[str]()
     if uncertain:
-        free = trajectory_covariance(problem, optimum, calibration.whitener)[: problem.n_free, : problem.n_free]
+        free = attempted(partial(_covariance, calibration), NO_UNCERTAINTY, failures)
     values = network.parameters.as_dict()
     misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
     return CalibratedModel(
@@ -267,8 +282,25 @@ def to_model(
         {s: float(m.length_s) for s, m in misfit.items()},
         calibration.max_step_s,
         dict(network.layout.table_knots),
-        _summary(calibration, effects, free, notices),
+        _summary(calibration, effects, free, [*notices, *failures]),
     )
+
+
+def _covariance(calibration: Calibration) -> FloatArray:
+    """Return the covariance of the free parameters; ArithmeticError where it is not finite."""
+    n_free = calibration.problem.n_free
+    full = trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
+    if not np.isfinite(full[:n_free, :n_free]).all():
+        raise ArithmeticError("it is not finite")
+    return full[:n_free, :n_free]
+
+
+def stated_guesses(network: Network) -> dict[str, float]:
+    """Return name -> value of the free parameters that the specification guesses, of a network at its starting values."""
+    declared = build_network(network.spec, table_knots=network.layout.table_knots).parameters.parameters
+    told = [p.name for p in declared if not (p.guessed or p.frozen) and p.prior_std is not None]
+    values = network.parameters.as_dict()
+    return {name: values[name] for name in told}
 
 
 def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray | None) -> Effect:
@@ -326,11 +358,17 @@ def _summary(
         "words": [
             *unseen_nodes(network.spec, [e.where["nodes"] for e in effects if "nodes" in e.where]),
             *resting_channels(network.spec, [s.record for s in problem.segments]),
-            *([NO_COVARIANCE] if covariance is None else words(network.parameters, covariance)),
+            *([NO_COVARIANCE] if covariance is None else _words(calibration, covariance)),
         ],
         "correlations": [] if covariance is None else strong_correlations(network.parameters, covariance),
         "notices": list(dict.fromkeys([*notices, *heard])),
     }
+
+
+def _words(calibration: Calibration, covariance: FloatArray) -> list[str]:
+    """Return what the data cannot see, in words; nothing where the arithmetic fails."""
+    guesses = stated_guesses(calibration.problem.network)
+    return attempted(lambda: words(calibration.network.parameters, covariance, guesses), "words", []) or []
 
 
 def acceptance(spec: TwinSpec, per_sensor: Json) -> Json:

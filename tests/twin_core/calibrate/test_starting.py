@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 
+from benchmarks.starts import attempt
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
+from twin_core.calibrate import calibrate
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.starting import balance_start, channel_levels, filled_columns
 from twin_core.network.model import build_network
+from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
+from twin_core.telemetry import Record
 
 
 def test_levels_are_where_a_channel_rests() -> None:
@@ -76,3 +80,48 @@ def test_declared_guesses_are_kept() -> None:
     network = build_network(load_spec(conductive_spec(2, [(0, 1)])))
     record = record_of(60.0 * np.arange(30), T0=290.0, T1=280.0)
     assert balance_start(build_problem(network, [record], np.ones(2))) == network.parameters
+
+
+def heated_board(scale: float, **load: object) -> tuple[TwinSpec, Record]:
+    """Return a board of 5 J/K behind a loss of 0.05 W/K, both times ``scale``, of which nothing is declared but a load.
+
+    The heater's channel is in percent of 3 W times ``scale``.
+    """
+    data = {
+        "twin": "board",
+        "boundaries": {"room": {"value_K": 295.0}},
+        "channels": {"T": {"kind": "temperature", "unit": "K"}, "H": {"kind": "power", "unit": "percent"}},
+        "nodes": [{"id": "board", "sensor": "T"}],
+        "conductors": [{"between": ["board", "room"]}],
+        "loads": [{"channel": "H", "node": "board"} | load],
+    }
+    time_s = 2.0 * np.arange(400)
+    heater = np.repeat([0.0, 100.0, 40.0, 80.0, 0.0, 60.0, 20.0, 100.0], 50)
+    rise = linear_states(np.array([[-0.01]]), (0.006 * heater)[:, None], np.zeros(1), time_s)[:, 0]
+    noisy = 295.0 + rise + np.random.default_rng(5).normal(0.0, 0.05, 400)
+    return load_spec(data), record_of(time_s, T=noisy, H=heater)
+
+
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
+def test_a_guessed_gain_sets_the_scale(scale: float) -> None:
+    """The balance is homogeneous: least squares would shrink capacity and loss to nothing while the gain stays."""
+    spec, record = heated_board(scale, gain={"guess": 0.03 * scale})
+    found = balance_start(build_problem(build_network(spec), [record], np.full(1, 0.05))).as_dict()
+    assert 0.5 < found["C:board"] / (5.0 * scale) < 2.0
+    assert 0.5 < found["G:board|room"] / (0.05 * scale) < 2.0
+    assert found["gain:H|board"] == 0.03 * scale
+
+
+def test_without_any_scale_the_ratios_are_found() -> None:
+    spec, record = heated_board(1.0)
+    model = calibrate(spec, [record])
+    assert abs(np.log(model.values["C:board"] / model.values["G:board|room"] / 100.0)) < 0.05
+    assert abs(np.log(model.values["C:board"] / model.values["gain:H|board"] * 0.03 / 5.0)) < 0.05
+    assert model.summary["rmse_K"] < 1.05 * 0.05
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_networks_are_found_from_any_subset_of_guesses(seed: int) -> None:
+    """Power over ten decades, 2 to 7 nodes; the truth is integrated by Runge and Kutta's method. All 500: benchmarks.starts."""
+    case, outcome = attempt(1000 + seed)
+    assert outcome.found, (case.kind, outcome)
