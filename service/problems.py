@@ -81,8 +81,10 @@ def answer(error: Exception) -> Response:
         return problem(error.status, error.detail, error.errors)
     if isinstance(error, TwinGone):
         return problem(404, "the twin was deleted meanwhile")
-    field, separator, reason = str(error).partition(": ")
-    return problem(422, str(error), [(field, reason)] if separator and " " not in field else [])
+    told = [line.partition(": ") for line in getattr(error, "problems", (str(error),))]
+    return problem(
+        422, str(error), [(field, reason) for field, separator, reason in told if separator and " " not in field]
+    )
 
 
 async def _nothing_there(scope: Scope, receive: Receive, send: Send) -> None:

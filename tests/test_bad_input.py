@@ -11,6 +11,8 @@ import pytest
 import yaml
 
 from replay.cli.main import main
+from twin_core.errors import SpecError
+from twin_core.network.spec_io import load_spec
 
 Edit = Callable[[dict[str, Any]], None]
 DELETED = object()
@@ -84,6 +86,38 @@ SPECIFICATIONS: list[tuple[Edit, str]] = [
     (edit("exclude", to=[{"start": 5, "stop": 9}]), "exclude[0].start: is a number of seconds"),
     (edit("criteria", to={"bias": 1}), "criteria.bias: unknown field"),
     (edit("criteria", to={"bias_K": float("inf")}), "criteria.bias_K"),
+    (
+        edit("criteria", to={"per_sensor": {"Q_a": {"std_K": 1}}}),
+        "criteria.per_sensor.Q_a: reads no node (sensors: T_a",
+    ),
+    (edit("channels", "T_a", "limits", to={}), "channels.T_a.limits: give 'yellow', 'red' or both"),
+    (edit("channels", "T_a", "limits", to={"red": [None, None]}), "channels.T_a.limits: red limits nothing"),
+    (edit("channels", "T_a", "limits", to={"red": [9, 3]}), "channels.T_a.limits: red limits contradict each other"),
+    (
+        edit("channels", "T_a", "limits", to={"yellow": [5, 90], "red": [0, 80]}),
+        "channels.T_a.limits: the yellow limit 90 lies above the red one 80",
+    ),
+    (edit("nodes", 0, "capacity_J_per_K", to={"value": 2, "spread": 2}), "spread says how far a guess may be off"),
+    (
+        edit("nodes", 0, "capacity_J_per_K", to={"guess": 2, "spread": 0.5}),
+        "capacity_J_per_K.spread: must be greater than 1",
+    ),
+    (edit("boundaries", "space", "spread", to=5), "boundaries.space: spread says by how many K"),
+    (edit("nodes", 0, "capacity_J_per_K", to={"per_mass": "cp"}), "'mass_kg' what multiplies it; give both"),
+    (
+        edit("nodes", 0, "capacity_J_per_K", to={"per_mass": "cp", "mass_kg": 2, "guess": 5}),
+        "nodes[0].capacity_J_per_K: give either 'per_mass' with 'mass_kg', or 'guess', not both",
+    ),
+    (
+        edit("nodes", 0, "capacity_J_per_K", to={"per_area": "h", "area_m2": 2}),
+        "capacity_J_per_K.per_area: unknown field",
+    ),
+    (
+        edit("nodes", 0, "capacity_J_per_K", to={"per_mass": "cp", "mass_kg": 2}),
+        "nodes[0].capacity_J_per_K.per_mass: unknown parameter 'cp'; declare it under parameters (known: none)",
+    ),
+    (edit("parameters", to={"h": {"guess": 5}}), "parameters.h: is used nowhere"),
+    (edit("parameters", to={"h": {"guess": -5}}), "parameters.h.guess: must be greater than 0"),
 ]
 
 TLE = [
@@ -356,6 +390,42 @@ def test_specification(
     (desk / "spec.yaml").write_text(yaml.safe_dump(pair))
     argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
     refuse(argv, desk, capsys, expected)
+
+
+def test_a_shared_unknown_has_one_unit(desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    pair["parameters"] = {"x": {"guess": 5.0}, "y": {"bounds": [1, 2]}}
+    pair["nodes"][0]["capacity_J_per_K"] = {"per_mass": "x", "mass_kg": 2.0}
+    pair["nodes"][1]["capacity_J_per_K"] = {"per_mass": "y", "mass_kg": 2.0}
+    pair["conductors"][0]["conductance_W_per_K"] = {"per_area": "x", "area_m2": 2.0}
+    (desk / "spec.yaml").write_text(yaml.safe_dump(pair))
+    argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
+    wrong = "conductors[0].conductance_W_per_K.per_area: 'x' is in J/kg/K elsewhere and would be in W/m2/K here"
+    refuse(argv, desk, capsys, f"spec.yaml: {wrong}", "; also: parameters.y: give a 'guess' that is calibrated")
+
+
+def test_everything_that_is_wrong_is_told_at_once(
+    desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Broken references, all of them; and faults of single fields, of which one that may be two types is told once."""
+    argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
+    for changes in (
+        [SPECIFICATIONS[i] for i, (_, text) in enumerate(SPECIFICATIONS) if "unknown channel 'T_z'" in text],
+        [
+            (edit("colour", to="red"), "colour: unknown field"),
+            (edit("nodes", 0, "sensor", to=5), "nodes[0].sensor"),
+            (edit("nodes", 0, "capacity_J_per_K", "guess", to=-5), "nodes[0].capacity_J_per_K.guess: must be greater"),
+            (edit("radiators", 0, "area_m2"), "radiators[0].area_m2: is missing"),
+        ],
+    ):
+        wrong = yaml.safe_load(yaml.safe_dump(pair))
+        for change, _ in changes:
+            change(wrong)
+        (desk / "spec.yaml").write_text(yaml.safe_dump(wrong))
+        refuse(argv, desk, capsys, *(text for _, text in changes))
+        with pytest.raises(SpecError) as caught:
+            load_spec(wrong)
+        assert str(caught.value) == caught.value.problems[0]
+        assert len(set(caught.value.problems)) == len(caught.value.problems) >= len(changes)
 
 
 @pytest.mark.parametrize(("name", "text", "expected"), TEXTS, ids=[f"{n}-{e}" for n, _, e in TEXTS])

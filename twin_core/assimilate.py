@@ -18,7 +18,7 @@ from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.state_space import LinearModel
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
-from twin_core.simulate.forcing import Forcing, build_forcing
+from twin_core.simulate.forcing import Forcing, build_forcing, first_boundary_K
 from twin_core.simulate.one_step import one_step
 from twin_core.telemetry import GAP_STEPS, Record
 
@@ -237,7 +237,12 @@ def _start(
     for sensor, node in enumerate(network.sensor_node):
         if np.isfinite(measured[:, sensor]).any():
             std[node] = START_STD_SENSED_K
-    return filled_columns(network, record.time_s, measured, None)[0], np.diag(std**2)
+    mean = filled_columns(network, record.time_s, measured, None)[0]
+    for extra in network.extra:
+        if extra.follows is not None:
+            at = network.layout.node(extra.name)
+            mean[at], std[at] = first_boundary_K(network.spec, record, extra.follows), START_STD_SENSED_K
+    return mean, np.diag(std**2)
 
 
 def _spread(filled: FloatArray, forcing: Forcing) -> FloatArray:

@@ -1,12 +1,22 @@
 """Errors: one root, few children. Every message names the field, row or node and says what to do."""
 
+from collections.abc import Sequence
+
 
 class TwinError(Exception):
     """Wrong input or an impossible request. The command line shows it in one line and exits with 2."""
 
 
 class SpecError(TwinError):
-    """A field of a specification, scenario or model file is wrong."""
+    """A field of a specification, scenario or model file is wrong; ``problems`` are all that is, the message the first.
+
+    Each problem is one line, ``field: what is wrong and what to do``, without the file's name.
+    """
+
+    def __init__(self, message: str, problems: Sequence[str] = ()) -> None:
+        """Keep the headline and all problems; the headline alone where no list is given."""
+        super().__init__(message)
+        self.problems = tuple(problems) or (message,)
 
 
 class TelemetryError(TwinError):

@@ -6,8 +6,9 @@ from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects import effect_to_json
+from twin_core.effects.heat import effect_heat_W
 from twin_core.forecast import future_record
-from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.dynamics import evaluate_balance, fill_boundaries
 from twin_core.network.model import Network, conductor_name
 from twin_core.network.terms import Along, Term
 from twin_core.simulate.forcing import build_forcing
@@ -32,9 +33,9 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
     Returns
     -------
     dict
-        ``nodes`` with temperature_K and net heat_W; ``boundaries`` with temperature_K; ``links`` (conductors and
-        radiators) whose heat_W flows from ``ends[0]`` to ``ends[1]``; ``loads`` and ``effects`` with the heat_W that
-        each brings into its nodes. The heats into a node add up to its net heat.
+        ``nodes`` with temperature_K and net heat_W; ``boundaries`` with the temperature_K that is declared; ``links``
+        (conductors and radiators) whose heat_W flows from ``ends[0]`` to ``ends[1]`` at these temperatures; ``loads`` and
+        ``effects`` with the heat_W that each brings into its nodes. The heats into a node add up to its net heat.
 
     Raises
     ------
@@ -47,7 +48,7 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
     values = network.parameters.values
     boundaries = dict(zip(network.layout.boundaries, along.boundaries_K[0].tolist(), strict=True))
     known = dict(zip(network.nodes, temperatures.tolist(), strict=True)) | boundaries
-    net = sum((_into_nodes(network, t, along, values) for t in network.terms), np.zeros(temperatures.size))
+    net = evaluate_balance(network, values, along).heat_W[0]
     read = {network.nodes[i] for i in network.sensor_node}
     return {
         "nodes": [
@@ -57,7 +58,7 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
         "boundaries": [{"id": name, "temperature_K": value} for name, value in boundaries.items()],
         "links": [*_conductors(model, known), *_radiators(model, known)],
         "loads": _loads(model, network, along, values),
-        "effects": _effects(model, network, along, values),
+        "effects": _effects(model, network, along),
     }
 
 
@@ -115,12 +116,11 @@ def _loads(model: CalibratedModel, network: Network, along: Along, values: Float
     return found
 
 
-def _effects(model: CalibratedModel, network: Network, along: Along, values: FloatArray) -> list[Json]:
+def _effects(model: CalibratedModel, network: Network, along: Along) -> list[Json]:
     """Return each effect with the heat that it brings into the nodes; effects on readings bring none."""
     found = []
     for effect in model.effects:
-        terms = effect.addition(network.layout).terms
-        heat = sum((_into_nodes(network, term, along, values) for term in terms), np.zeros(len(network.nodes)))
+        heat = effect_heat_W(effect, network, along)[0]
         data = effect_to_json(effect)
         into = {name: float(q) for name, q in zip(network.nodes, heat, strict=True) if q != 0.0}
         found.append({"effect": data["effect"], "where": data["where"], "heat_W": into})

@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explain(error: Exception) -> int:
-    """Say in one line what is wrong and return the exit code."""
+    """Say in one line what is wrong, the first fault in front, and return the exit code."""
     if isinstance(error, click.UsageError):
         command = error.ctx.command_path if error.ctx else "twin"
         return _say(f"{error.format_message().rstrip('.')}; see {command} --help", BAD_INPUT)
@@ -67,7 +67,8 @@ def _explain(error: Exception) -> int:
     if isinstance(error, NoSolutionError):
         return _say(str(error), ANSWER_IS_NO)
     if isinstance(error, TwinError | ReplayError):
-        return _say(str(error), BAD_INPUT)
+        also = "; ".join(getattr(error, "problems", ())[1:])
+        return _say(f"{error}; also: {also}" if also else str(error), BAD_INPUT)
     return _say(
         f"a fault of the program: {type(error).__name__}: {error}; run twin --traceback and report it", INTERNAL
     )

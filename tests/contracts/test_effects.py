@@ -12,7 +12,9 @@ from scipy.integrate import solve_ivp
 from tests.helpers import active_effect, every_term_network, null_effects, points, survey_of
 from twin_core.effects import REGISTRY, Effect, effect_from_json, effect_to_json
 from twin_core.effects.base import Quality, Survey
+from twin_core.network.dynamics import evaluate_balance
 from twin_core.network.model import Layout, Network
+from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along
 
 WHERE_KEYS = {"node", "nodes", "sink", "boundary", "channel", "sensor"}
@@ -42,6 +44,11 @@ def adds_a_reading(effect: Effect) -> bool:
     return any(node.reads is not None for node in effect.extra_nodes(every_term_network().layout))
 
 
+def lags_a_boundary(effect: Effect) -> bool:
+    """Whether the effect adds a state that stands for a boundary; see tests/twin_core/effects/test_boundaries.py."""
+    return any(node.follows is not None for node in effect.extra_nodes(every_term_network().layout))
+
+
 def stores_heat(effect: Effect) -> bool:
     """Whether the effect adds a mass: the unit capacity of a mere state, such as a relay's, is held."""
     return any(not node.capacity.frozen for node in effect.extra_nodes(every_term_network().layout))
@@ -54,11 +61,22 @@ def smooth_points(network: Network, n_points: int) -> Along:
     return replace(along, temperatures_K=285.0 + 20.0 * np.sin(phase))
 
 
+def sink_heat_W(network: Network, along: Along) -> np.ndarray:
+    """Return what the declared network exchanges through changed boundaries beyond what it does through declared ones."""
+    declared, n = every_term_network(), len(every_term_network().nodes)
+    bare = replace(along, temperatures_K=along.temperatures_K[:, :n])
+    changed = replace(bare, boundaries_K=surround(network, network.parameters.values, along).along.boundaries_K)
+    heat = np.zeros_like(along.temperatures_K)
+    for points_, sign in ((changed, 1.0), (bare, -1.0)):
+        heat[:, :n] += sign * evaluate_balance(declared, declared.parameters.values, points_).heat_W
+    return heat
+
+
 def added_heat_W(effect: Effect, network: Network, along: Along, rate_K_per_s: np.ndarray) -> np.ndarray:
     """Return the heat that an effect brings into every state, extra capacity as heat that it swallows."""
     addition = effect.addition(network.layout)
     named = network.parameters.as_dict() | {p.name: p.value for p in effect.parameters()}
-    heat = np.zeros_like(along.temperatures_K)
+    heat = sink_heat_W(network, along) if addition.boundaries else np.zeros_like(along.temperatures_K)
     for term in addition.terms:
         part = term.evaluate(along, np.array([named[n] for n in (*(p.name for p in term.parameters), *term.borrows)]))
         heat[:, list(part.nodes)] += part.heat_W
@@ -155,7 +173,7 @@ def test_it_starts_at_null(kind: type[Effect]) -> None:
 def test_null_is_exactly_nothing(kind: type[Effect]) -> None:
     network = every_term_network()
     for effect in null_effects(kind):
-        if adds_a_reading(effect):
+        if adds_a_reading(effect) or lags_a_boundary(effect):
             continue  # no lag is a state that moves at once: see the test of a lag that vanishes
         heat = declared_heat_W(effect, survey_of(network, smooth_points(network, 20)))
         np.testing.assert_array_equal(heat, 0.0)
@@ -208,6 +226,8 @@ def test_unit_heats_are_the_slope_of_the_added_heat(kind: type[Effect]) -> None:
     survey = survey_of(network, smooth_points(network, 40))
     where = next(w for w in kind.places(network.layout) if list(kind.starts(w, survey)))
     for effect in kind.starts(where, survey):
+        if lags_a_boundary(effect):
+            continue  # its response is that at the assumed lag, not at none
         columns = effect.unit_heats(survey)
         assert len(columns) == len(effect.amplitudes)
         if adds_a_reading(effect):
@@ -223,18 +243,21 @@ def test_unit_heats_are_the_slope_of_the_added_heat(kind: type[Effect]) -> None:
 
 
 def slope_at_null(effect: Effect, survey: Survey, amplitude: int, step: float = 1e-3) -> np.ndarray:
-    """Return d heat / d amplitude at null by a one-sided difference of second order: some amplitudes are positive."""
+    """Return d heat / d amplitude at null by one-sided differences of second order: some amplitudes are positive.
 
-    def heat(amount: float) -> np.ndarray:
-        amounts = np.full(len(effect.amplitudes), 0.0)
-        amounts[amplitude] = amount
-        moved = effect.with_amplitudes(amounts) if amount else effect
-        if moved is None:  # the other amplitudes are positive and cannot be null: keep them out of the way
-            moved = effect.with_amplitudes(np.where(np.arange(amounts.size) == amplitude, amount, 1e-9))
-        assert moved is not None
-        return declared_heat_W(moved, survey)
+    Some cannot move alone either: the slope is that along all of them with this one twice, less that along all.
+    """
 
-    return (4.0 * heat(step) - heat(2.0 * step) - 3.0 * heat(0.0)) / (2.0 * step)
+    def slope(direction: np.ndarray) -> np.ndarray:
+        def heat(amount: float) -> np.ndarray:
+            moved = effect.with_amplitudes(amount * direction) if amount else effect
+            assert moved is not None
+            return declared_heat_W(moved, survey)
+
+        return (4.0 * heat(step) - heat(2.0 * step) - 3.0 * heat(0.0)) / (2.0 * step)
+
+    together, alone = np.ones(len(effect.amplitudes)), np.eye(len(effect.amplitudes))[amplitude]
+    return slope(together + alone) - slope(together)
 
 
 @each_effect
@@ -299,7 +322,7 @@ def test_amplitudes_that_are_not_physical_are_refused_or_put_on_their_bound(kind
     effect = null_effects(kind)[0]
     qualities = [effect.qualities()[i] for i in effect.amplitudes]
     far = effect.with_amplitudes(np.full(len(qualities), -1.0e6))
-    assert (far is None) == any(q.positive and not q.null for q in qualities)
+    assert (far is None) == any((q.positive and not q.null) or q.upper is not None for q in qualities)
     if far is not None:
         assert all(q.lower is None or far.values[q.name] == q.lower for q in qualities)
         assert all(far.values[q.name] > 0.0 for q in qualities if q.positive)

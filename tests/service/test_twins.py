@@ -28,6 +28,16 @@ def test_life_of_a_twin(client: AppClient, spec: dict) -> None:
     assert client.post("/v1/twins", json={**spec, "loads": []}).status_code == 201
 
 
+def test_everything_that_is_wrong_with_a_specification_is_told_at_once(client: AppClient, spec: dict) -> None:
+    spec["loads"] = [{"channel": "Q_none", "node": "px"}, {"channel": "Q_none", "node": "nowhere"}]
+    answer = client.post("/v1/twins", json=spec)
+    assert answer.status_code == 422
+    told = answer.json()
+    assert [e["field"] for e in told["errors"]] == ["loads[0].channel", "loads[1].node", "loads[1].channel"]
+    assert told["detail"].startswith("loads[0].channel: unknown channel 'Q_none'")
+    assert client.get("/v1/twins").json() == {"twins": []}
+
+
 def test_deleting_takes_the_archive_along(registered: AppClient, spec: dict) -> None:
     registered.post("/v1/twins/benchsat/telemetry", json={"time": [1.0], "values": {"T_px": [290.0]}})
     registered.delete("/v1/twins/benchsat")

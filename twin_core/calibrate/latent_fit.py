@@ -43,6 +43,9 @@ def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
     """Return temperatures at every grid point, (n_steps + 1, n_nodes), interpolated from the readings."""
     network, at = problem.network, segment.forcing.sample_step
     filled = filled_columns(network, segment.record.time_s, segment.measured_K, None)
+    for extra in network.extra:
+        if extra.follows is not None:
+            filled[:, network.layout.node(extra.name)] = segment.start_prior_K[network.layout.node(extra.name)]
     grid = np.arange(segment.forcing.n_steps + 1)
     return np.stack([np.interp(grid, at, column) for column in filled.T], axis=1)
 

@@ -12,7 +12,7 @@ from twin_core.network.model import Network
 from twin_core.network.screened import excluded
 from twin_core.network.spec import TwinSpec
 from twin_core.parameters.transforms import is_logarithmic
-from twin_core.simulate.forcing import Forcing, build_forcing
+from twin_core.simulate.forcing import Forcing, build_forcing, first_boundary_K
 from twin_core.simulate.response import sensitivities
 from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
@@ -20,6 +20,9 @@ from twin_core.telemetry import Record
 START_STD_SENSED_K = 5.0
 START_STD_HIDDEN_K = 30.0
 """Prior standard deviations of initial temperatures: around the first readings, and of nodes that nobody reads."""
+
+KNOWN_START_STD_K = 1e-3
+"""Of a state whose start is known: below any sensor's resolution, yet the normal equations stay well conditioned."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ def measured_temperatures(spec: TwinSpec, record: Record) -> FloatArray:
     return measured
 
 
-def _start_prior(network: Network, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _start_prior(network: Network, record: Record, measured: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return mean and standard deviation of the initial temperatures, (n_nodes,) each."""
     first = np.array([c[np.isfinite(c)][:3].mean() if np.isfinite(c).any() else np.nan for c in measured.T])
     typical = float(np.nanmean(first)) if np.isfinite(first).any() else 293.15
@@ -73,6 +76,8 @@ def _start_prior(network: Network, measured: FloatArray) -> tuple[FloatArray, Fl
         if std[position] == START_STD_HIDDEN_K:
             mean[position] = mean[network.layout.node(extra.like)]
             std[position] = START_STD_SENSED_K
+        if extra.follows is not None:
+            mean[position], std[position] = first_boundary_K(network.spec, record, extra.follows), KNOWN_START_STD_K
     return mean, std
 
 
@@ -82,7 +87,7 @@ def build_segment(network: Network, record: Record, max_step_s: float) -> Segmen
     if record.time_s.size < 3 or int(np.isfinite(measured).sum()) < 3:
         sensors = ", ".join(network.spec.sensors)
         raise TelemetryError(f"{record.name}: fewer than three usable samples of {sensors}; nothing can be fitted")
-    mean, std = _start_prior(network, measured)
+    mean, std = _start_prior(network, record, measured)
     return Segment(record, build_forcing(network, record, max_step_s), measured, mean, std)
 
 
@@ -157,7 +162,8 @@ class Problem:
         leap[self.logarithmic] = np.minimum(leap[self.logarithmic], longest_log)
         lowest = -leap
         lowest[: self.n_free] = np.maximum(lowest[: self.n_free], parameters.lowest - unknowns[: self.n_free])
-        return np.minimum(lowest, 0.0), leap
+        leap[: self.n_free] = np.minimum(leap[: self.n_free], parameters.highest - unknowns[: self.n_free])
+        return np.minimum(lowest, 0.0), np.maximum(leap, 0.0)
 
     def start(self) -> FloatArray:
         """Return the unknown vector at the network's present values and the prior initial states."""
@@ -294,7 +300,7 @@ class Problem:
             return replace(self, network=network)
         segments = []
         for segment in self.segments:
-            mean, std = _start_prior(network, segment.measured_K)
+            mean, std = _start_prior(network, segment.record, segment.measured_K)
             segments.append(replace(segment, start_prior_K=mean, start_std_K=std))
         return replace(self, network=network, segments=tuple(segments))
 

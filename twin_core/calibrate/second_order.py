@@ -328,6 +328,7 @@ def _summary(
         by_name = dict(zip(network.parameters.free_names, (stds * slopes).tolist(), strict=True))
         told = identified(network.parameters, stds)
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
+    fit = with_met(network.spec, fit)
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
     heard += orbit_notices(network.spec, [s.record for s in problem.segments])
@@ -354,6 +355,7 @@ def _summary(
                 "held": p.frozen,
             }
             for p in network.parameters.parameters
+            if p.tied_to is None  # what is tied is told by what it is tied to
         ],
         "words": [
             *unseen_nodes(network.spec, [e.where["nodes"] for e in effects if "nodes" in e.where]),
@@ -372,15 +374,38 @@ def _words(calibration: Calibration, covariance: FloatArray) -> list[str]:
 
 
 def acceptance(spec: TwinSpec, per_sensor: Json) -> Json:
-    """Return the correlation acceptance: worst bias and worst 99 % error over the sensors, and whether both are met."""
-    bias = max((abs(row["bias_K"]) for row in per_sensor.values()), default=0.0)
-    spread = max((row["q99_abs_K"] for row in per_sensor.values()), default=0.0)
-    limits = spec.criteria
-    met = bias <= limits.bias_K and spread <= limits.q99_abs_K
+    """Return the correlation acceptance: worst errors over the sensors, the limits of all, and whether each meets its own.
+
+    Parameters
+    ----------
+    spec
+        Declares the criteria.
+    per_sensor
+        ``bias_K``, ``std_K`` and ``q99_abs_K`` of each sensor.
+
+    Returns
+    -------
+    dict
+        Worst ``bias_K``, ``std_K`` and ``q99_abs_K``; ``limit_…`` of each; ``met`` by all sensors; and under ``per_sensor``
+        the limits of each and whether it has ``met`` them.
+    """
+    rows = {}
+    for sensor, row in per_sensor.items():
+        limits = spec.criteria.of(sensor)
+        rows[sensor] = {
+            **{f"limit_{name}": limit for name, limit in limits.items()},
+            "met": all(abs(row[name]) <= limit for name, limit in limits.items()),
+        }
+    names = ("bias_K", "std_K", "q99_abs_K")
     return {
-        "bias_K": bias,
-        "q99_abs_K": spread,
-        "limit_bias_K": limits.bias_K,
-        "limit_q99_abs_K": limits.q99_abs_K,
-        "met": bool(met),
+        **{name: max((abs(row[name]) for row in per_sensor.values()), default=0.0) for name in names},
+        **{f"limit_{name}": getattr(spec.criteria, name) for name in names},
+        "met": all(row["met"] for row in rows.values()),
+        "per_sensor": rows,
     }
+
+
+def with_met(spec: TwinSpec, scores: Json) -> Json:
+    """Return the scores of a fit or a prediction with whether each sensor has ``met`` its criteria."""
+    rows = acceptance(spec, scores["per_sensor"])["per_sensor"]
+    return {**scores, "per_sensor": {s: {**row, "met": rows[s]["met"]} for s, row in scores["per_sensor"].items()}}

@@ -138,6 +138,9 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
     for node, index in enumerate(network.capacity_index):
         design[:, node, index] -= np.diff(at_edges[:, node])
         place[index] = node
+    for i, (shared, size) in network.parameters.ties.items():
+        design[:, :, shared] += size * design[:, :, i]
+        design[:, :, i], place[shared] = 0.0, place[i]
     return design, place
 
 

@@ -48,7 +48,7 @@ def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Seq
     Returns
     -------
     dict
-        ``rmse_K``, ``pcc`` and ``per_sensor`` with ``rmse_K``, ``pcc``, ``bias_K``, ``q99_abs_K`` each.
+        ``rmse_K``, ``pcc`` and ``per_sensor`` with ``rmse_K``, ``pcc``, ``bias_K``, ``std_K``, ``q99_abs_K`` each.
     """
     all_measured = np.concatenate(list(measured))
     all_predicted = np.concatenate(list(predicted))
@@ -61,6 +61,7 @@ def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Seq
                 "rmse_K": rmse(finite),
                 "pcc": pearson(all_measured[:, i], all_predicted[:, i]),
                 "bias_K": float(finite.mean()),
+                "std_K": float(finite.std()),
                 "q99_abs_K": float(np.quantile(np.abs(finite), 0.99)),
             }
     pooled = pearson(all_measured.ravel(), all_predicted.ravel())

@@ -47,6 +47,9 @@ def balance_of(problem: Problem) -> Balance:
     if (network.boundary_index >= 0).any():
         name = network.layout.boundaries[int(np.argmax(network.boundary_index >= 0))]
         raise ModelError(f"boundary '{name}' has no known temperature, which this method needs; use second-order")
+    if network.parameters.ties:
+        name = network.parameters.parameters[next(iter(network.parameters.ties.values()))[0]].name
+        raise ModelError(f"parameter '{name}' is shared, which this method cannot do; use second-order")
     loads = tuple(term for term in network.terms if isinstance(term, ChannelLoad))
     n, n_boundaries = len(network.nodes), len(network.layout.boundaries)
     design = np.zeros((len(network.parameters), n, 2 * (n + n_boundaries) + len(loads)))

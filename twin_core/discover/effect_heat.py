@@ -4,10 +4,9 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.discover.judge import Search
-from twin_core.effects.base import Effect, touched_nodes
+from twin_core.effects.base import touched_nodes
+from twin_core.effects.heat import effect_heat_W
 from twin_core.network.dynamics import fill_boundaries
-from twin_core.network.model import Network
-from twin_core.network.terms import Along
 
 MAX_NODES = 4
 """Nodes of interest at most."""
@@ -52,15 +51,6 @@ def effect_heat(search: Search, states_K: FloatArray, first_step: int) -> FloatA
     stages[:, :, :declared] = states_K[:, None, :]
     boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(first_step, last))
     along = forcing.along(stages.reshape(-1, stages.shape[2]), boundaries, first_step, last)
-    total = np.sum([_heat_of(effect, network, along) for effect in search.trial.effects], axis=0)
+    total = np.sum([effect_heat_W(effect, network, along) for effect in search.trial.effects], axis=0)
     total[:, ~total.any(axis=0)] = np.nan
     return total[1::2, :declared]
-
-
-def _heat_of(effect: Effect, network: Network, along: Along) -> FloatArray:
-    """Return the heat of an effect of a network at the network's own values, (n_points, n_nodes)."""
-    total = np.zeros((along.time_s.size, len(network.nodes)))
-    for term in effect.addition(network.layout).terms:
-        part = term.evaluate(along, network.parameters.values[network.term_index(term)])
-        total[:, list(part.nodes)] += part.heat_W
-    return total

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import acceptance
+from twin_core.calibrate.second_order import acceptance, with_met
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.discover.experiments import separating
 from twin_core.discover.holdout import HeldOut, Prediction
@@ -151,7 +151,7 @@ def build_report(
         ``effect_added``, ``no_effect_supported`` or ``unexplained``.
     """
     sensors = before.spec.sensors
-    scores = [held_out_scores(sensors, p) for p in predictions]
+    scores = [with_met(before.spec, held_out_scores(sensors, p)) for p in predictions]
     train = [segment.record for segment in search.base.fit.problem.segments]
     residuals = [[p.measured_K - p.predicted_K for p in ps] for ps in predictions]
     scored = [h.scored for h in held]

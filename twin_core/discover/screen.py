@@ -15,6 +15,7 @@ from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns,
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
+from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along
 from twin_core.simulate.response import heat_response
 from twin_core.simulate.stages import balance_along
@@ -62,7 +63,8 @@ def survey_of(fit: HeatFit) -> Survey:
         forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
         flat = forcing.boundaries_flat_K(0, forcing.n_steps)
         filled = fill_boundaries(network, values, flat)
-        parts.append(forcing.along(stages.reshape(-1, stages.shape[2]), filled, 0, forcing.n_steps))
+        points = forcing.along(stages.reshape(-1, stages.shape[2]), filled, 0, forcing.n_steps)
+        parts.append(surround(network, values, points).along)
         balance = balance_along(network, values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
         rates.append(balance.rate_K_per_s)
     edges = np.cumsum([0] + [part.time_s.size for part in parts])
@@ -79,6 +81,7 @@ def survey_of(fit: HeatFit) -> Survey:
         np.concatenate([r.clock_s[n.segment.valid.any(axis=1)] for r, n in zip(records, fit.nominals, strict=True)]),
         records[0].epoch_ns is not None,
         np.concatenate([_residual_at_points(nominal) for nominal in fit.nominals]),
+        network.terms,
     )
 
 
@@ -101,6 +104,7 @@ def _joined(parts: Sequence[Along]) -> Along:
         np.concatenate([p.boundaries_K for p in parts]),
         {name: np.concatenate([p.inputs[name] for p in parts]) for name in common},
         np.concatenate([p.sun_factor for p in parts]),
+        given_K=np.concatenate([p.declared_K for p in parts]),
     )
 
 

@@ -4,6 +4,9 @@ from typing import Any
 
 from twin_core.effects.base import Effect, Quality, Survey, Where, require
 from twin_core.effects.base import to_json as effect_to_json
+from twin_core.effects.boundary_lag import BoundaryLag
+from twin_core.effects.boundary_mix import BoundaryMix
+from twin_core.effects.boundary_offset import BoundaryOffset
 from twin_core.effects.capacity_temperature import CapacityTemperature
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
 from twin_core.effects.conductance_step import ConductanceStep
@@ -55,6 +58,9 @@ REGISTRY: dict[str, type[Effect]] = {
         CapacityTemperature,
         LatentHeat,
         HiddenMass,
+        BoundaryOffset,
+        BoundaryLag,
+        BoundaryMix,
         SensorBias,
         SensorDrift,
         SensorLag,

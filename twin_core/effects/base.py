@@ -13,10 +13,10 @@ import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, Json
 from twin_core.errors import ModelError
-from twin_core.network.model import Addition, ExtraNode, Layout
+from twin_core.network.model import Addition, ExtraNode, Layout, declared_terms
 from twin_core.network.terms import Along, CapacityTerm, ReadingTerm, Term
 from twin_core.parameters.parameter import Parameter
-from twin_core.parameters.transforms import Floored, Identity, Log, Shifted, Transform
+from twin_core.parameters.transforms import Bounded, Identity, Log, Shifted, Transform
 from twin_core.units import format_instant
 
 Where = dict[str, Any]
@@ -49,6 +49,8 @@ class Quality:
         For an instant on the clock of ``Record.clock_s``: where the solver counts from, and in what; None for others.
     open_ended
         Whether the data may tell no more than that it is large: a limit that was never reached.
+    upper
+        The greatest value, itself possible; None where there is none.
     """
 
     name: str
@@ -61,6 +63,7 @@ class Quality:
     leap: float | None = None
     resolution: float = 0.0
     open_ended: bool = False
+    upper: float | None = None
 
     @property
     def transform(self) -> Transform:
@@ -69,7 +72,9 @@ class Quality:
             return Log()
         if self.leap is not None:
             return Shifted(0.0, self.leap)
-        return self.instant or (Identity() if self.lower is None else Floored(self.lower))
+        if self.lower is None and self.upper is None:
+            return self.instant or Identity()
+        return Bounded(-np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper)
 
     def spread(self, fitted: float) -> float:
         """Return the standard deviation, given that of a fit; one as wide as its prior says that the fit tells nothing."""
@@ -121,6 +126,8 @@ class Survey:
         Whether that clock shows dates or a file's own seconds.
     residual_K : (n_points, n_sensors)
         Measured minus modelled, interpolated where nothing was read.
+    terms
+        Everything that exchanges heat in the model so far; what is declared where not given.
     """
 
     layout: Layout
@@ -133,6 +140,20 @@ class Survey:
     sample_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     dated: bool = False
     residual_K: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    terms: tuple[Term, ...] = ()
+
+    def through_boundary(self, name: str) -> list[tuple[int, FloatArray]]:
+        """Return the heat into the nodes per kelvin of a boundary: (node, (n_points,) in W/K) for all that reads it."""
+        boundary, through = self.layout.boundary(name), []
+        for term in self.terms or declared_terms(self.layout):
+            named = [p.name for p in term.parameters] + list(term.borrows)
+            values = np.array([self.parameters.get(n, np.nan) for n in named])
+            through += [e for e in term.evaluate(self.along, values).d_boundaries if e.item == boundary]
+        return [(entry.node, entry.series) for entry in through]
+
+    def declared_boundary_K(self, name: str) -> FloatArray:
+        """Return a boundary's temperature as it is declared, before effects change it, (n_points,)."""
+        return self.along.declared_K[:, self.layout.boundary(name)]
 
     def temperature_K(self, node: str) -> FloatArray:
         """Return a node's temperature along the record, (n_points,)."""
@@ -357,13 +378,15 @@ def require(where: Where, kind: type[Effect]) -> None:
 
 
 def touched_nodes(effect: Effect, layout: Layout) -> list[str]:
-    """Return the declared nodes at which an effect acts: those that a channel feeds, the one that a sensor reads."""
+    """Return the declared nodes at which an effect acts: that a channel feeds, that a sensor reads, that face a boundary."""
     if "node" in effect.where:
         return [effect.where["node"]]
     if "nodes" in effect.where:
         return [n for n in effect.where["nodes"] if n in layout.declared_nodes]
     if "channel" in effect.where:
         return [load.node for load in layout.loads_of(effect.where["channel"])]
+    if "boundary" in effect.where:
+        return [node for node, boundary in layout.surfaces if boundary == effect.where["boundary"]]
     return [layout.sensor_node(effect.where["sensor"])]
 
 

@@ -236,9 +236,14 @@ def _unknown(field: str, name: str, known: list[str], what: str) -> Iterable[str
         yield f"{field}: unknown {what} '{name}' (known: {', '.join(known) or 'none'})"
 
 
-def _one_line(error: ValidationError) -> str:
-    """Return the first problem as ``field: what is wrong``; the tags of signals and effects are no fields."""
-    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+def _in_words(error: ValidationError) -> list[str]:
+    """Return every problem as ``field: what is wrong``, missing fields last."""
+    items = sorted(error.errors(), key=lambda item: item["type"] == "missing")
+    return list(dict.fromkeys(_one_line(item) for item in items))
+
+
+def _one_line(first: Mapping[str, Any]) -> str:
+    """Return one problem as ``field: what is wrong``; the tags of signals and effects are no fields."""
     where = ""
     for previous, part in zip((None, *first["loc"]), first["loc"], strict=False):
         if isinstance(part, int):
@@ -254,7 +259,7 @@ def _one_line(error: ValidationError) -> str:
 
 def load_scenario(source: Path | str | dict[str, Any]) -> Scenario:
     """Return the validated scenario from a YAML or JSON file, or from its parsed mapping; SpecError as ``read_model``."""
-    return read_model(source, Scenario, _one_line)
+    return read_model(source, Scenario, _in_words)
 
 
 __all__ = ["Scenario", "load_scenario"]

@@ -10,6 +10,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.network.jacobian import Jacobian, JacobianSum
 from twin_core.network.model import Network
 from twin_core.network.storage import store
+from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along, Entry
 
 
@@ -100,7 +101,7 @@ def evaluate_balance(
     values : (n_parameters,)
         Physical parameter values.
     along
-        The points; its boundaries must be filled.
+        The points; its boundaries must be filled. Effects on boundaries act here, for all terms alike.
     derivatives
         Whether to return the parameter derivatives too.
     extra_W : (n_points, n_nodes)
@@ -114,15 +115,18 @@ def evaluate_balance(
         C_i dT_i/dt = sum of the terms' heats into node i.
     """
     n_points, n_nodes = along.temperatures_K.shape
-    along = replace(along, derivatives=derivatives)
+    around = surround(network, values, replace(along, derivatives=derivatives))
     heat = np.zeros((n_points, n_nodes)) if extra_W is None else extra_W.astype(np.float64)
     jacobian = JacobianSum(n_nodes)
     everywhere = tuple(range(n_nodes))
     entries: list[Entry] = []
     for position in range(len(network.terms)) if only is None else only:
         index = network.term_indices[position]
-        part = network.terms[position].evaluate(along, values[index])
+        part = network.terms[position].evaluate(around.along, values[index])
         jacobian.add(part)
+        for e in part.d_boundaries:
+            for state, series in around.by_state.get(e.item, ()):
+                jacobian.add_entry(e.node, state, e.series * series)
         if len(part.nodes) == 1:  # slices, which cost a fraction of index arrays
             heat[:, part.nodes[0]] += part.heat_W[:, 0]
         elif part.nodes == everywhere:
@@ -132,9 +136,9 @@ def evaluate_balance(
         if derivatives:
             entries += [Entry(int(index[e.item]), e.node, e.series) for e in part.d_values]
             entries += [
-                Entry(int(network.boundary_index[e.item]), e.node, e.series)
+                Entry(item, e.node, e.series * series)
                 for e in part.d_boundaries
-                if network.boundary_index[e.item] >= 0
+                for item, series in around.by_value.get(e.item, ())
             ]
     own = values[network.capacity_index]
     storage = store(network, values, along.temperatures_K)
@@ -182,6 +186,9 @@ def free_entries(
         return nothing, nothing, np.zeros((0, n_points))
     parameters = network.parameters
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
+    if parameters.ties:  # the chain rule: what moves with a shared unknown counts as moved by it
+        told = [(*parameters.ties.get(row.item, (row.item, 1.0)), row) for row in rows]
+        rows = [Entry(item, row.node, size * row.series) for item, size, row in told]
     kept = [row for row in rows if row.item in position]
     at = parameters.at_values(values)
     slopes = {item: at.parameters[item].transform.slope(at.parameters[item].free) for item in {r.item for r in kept}}

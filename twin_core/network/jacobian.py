@@ -81,6 +81,13 @@ class JacobianSum:
                 if part.d_temperature[:, a, b].any():
                     self.moving.append((row, column, part.d_temperature[:, a, b]))
 
+    def add_entry(self, row: int, column: int, series: FloatArray) -> None:
+        """Add one entry along the points, (n_points,)."""
+        if series.size and np.ptp(series) == 0.0:
+            self.constant[row, column] += series[0]
+        else:
+            self.moving.append((row, column, series))
+
     def over(self, capacity_J_per_K: FloatArray, n_points: int) -> Jacobian:
         """Return the Jacobian of the heats over each node's own capacity (n_nodes,), at n_points."""
         moving = np.empty((n_points, len(self.moving)))

@@ -1,5 +1,6 @@
 """A network ready to be evaluated: the declared specification and any added effects as terms over one parameter set."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -9,10 +10,11 @@ import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
-from twin_core.network.quantities import Quantity, guess_or
+from twin_core.network.quantities import Quantity, Tied, guess_or
 from twin_core.network.spec import Channel, Load, TwinSpec
 from twin_core.network.terms import (
     BoundaryConductor,
+    BoundaryTerm,
     CapacityTerm,
     ChannelLoad,
     Conductors,
@@ -23,6 +25,9 @@ from twin_core.network.terms import (
 )
 from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD, Parameter, positive, real
 from twin_core.parameters.vector import ParameterSet
+
+SINK_STD_K = 50.0
+"""Prior standard deviation of an unknown sink whose guess comes without a spread."""
 
 
 @dataclass(frozen=True)
@@ -39,12 +44,15 @@ class ExtraNode:
         The node whose initial temperature it starts from.
     reads
         The sensor that reads this state instead of its node; None for most.
+    follows
+        The boundary at whose first temperature it starts, known; None for most.
     """
 
     name: str
     capacity: Parameter
     like: str
     reads: str | None = None
+    follows: str | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +62,7 @@ class Addition:
     terms: tuple[Term, ...] = ()
     capacities: tuple[CapacityTerm, ...] = ()
     readings: tuple[ReadingTerm, ...] = ()
+    boundaries: tuple[BoundaryTerm, ...] = ()
     nodes: tuple[ExtraNode, ...] = ()
     dated: bool | None = None
     """Whether the instants that it knows are dates or a file's own seconds; None where it knows no instant."""
@@ -117,6 +126,13 @@ class Layout:
         """The pairs of nodes, or node and boundary, that a declared conductor joins."""
         return {frozenset(c.between) for c in self.spec.conductors}
 
+    @property
+    def surfaces(self) -> list[tuple[str, str]]:
+        """(node, boundary) of every declared conductor or radiator to a boundary, each once."""
+        ends = [tuple(c.between) for c in self.spec.conductors]
+        pairs = [(a, b) for x, y in ends for a, b in ((x, y), (y, x)) if b in self.boundaries]
+        return list(dict.fromkeys([*pairs, *((r.node, r.sink) for r in self.spec.radiators)]))
+
     def loads_of(self, channel: str) -> tuple[Load, ...]:
         """Return the declared loads that a channel drives."""
         return tuple(load for load in self.spec.loads if load.channel == channel)
@@ -138,13 +154,25 @@ def radiator_name(node: str, sink: str) -> str:
 
 
 def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -> Parameter:
-    """Return the parameter of a declared quantity; an undeclared one starts from ``default`` with a flat prior."""
+    """Return the parameter of a declared quantity; an undeclared one starts from ``default`` with a flat prior.
+
+    The value of a tied one is its size until the parameter set makes it follow.
+    """
+    if isinstance(quantity, Tied) and quantity.tie is not None:
+        shared, size = quantity.tie
+        return replace(positive(name, unit, size, prior_std=None), tied_to=shared, size=size)
     value = guess_or(quantity, default)
     known = quantity is not None and quantity.value is not None
     declared = quantity is not None and quantity.guess is not None
     bounds = None if quantity is None else quantity.bounds
     prior = GUESS_LOG_STD if declared else NO_GUESS_LOG_STD
-    return positive(name, unit, value, bounds=bounds, prior_std=prior, frozen=known, guessed=not (known or declared))
+    parameter = positive(
+        name, unit, value, bounds=bounds, prior_std=prior, frozen=known, guessed=not (known or declared)
+    )
+    if quantity is None or quantity.spread is None:
+        return parameter
+    log_slope = parameter.transform.slope(parameter.free) / value  # one where the solver's number is the logarithm
+    return replace(parameter, prior_std=math.log(quantity.spread) / log_slope)
 
 
 @dataclass(frozen=True)
@@ -159,6 +187,8 @@ class Network:
         Every number of the model: capacities, conductances, gains, tables, unknown sinks, effects.
     terms, capacities, readings
         The heat balance, temperature-dependent capacity, and sensor faults.
+    boundary_terms
+        What effects make of boundary temperatures, in the order in which they act.
     sensor_node : (n_sensors,)
         Position of the state that each sensor reads.
     extra
@@ -175,6 +205,7 @@ class Network:
     sensor_node: IntArray
     extra: tuple[ExtraNode, ...]
     dated: bool | None = None
+    boundary_terms: tuple[BoundaryTerm, ...] = ()
 
     @property
     def spec(self) -> TwinSpec:
@@ -199,7 +230,7 @@ class Network:
         index = self.parameters.index
         return np.array([index.get(f"T:{name}", -1) for name in self.layout.boundaries], dtype=np.int64)
 
-    def term_index(self, term: Term | CapacityTerm | ReadingTerm) -> IntArray:
+    def term_index(self, term: Term | CapacityTerm | ReadingTerm | BoundaryTerm) -> IntArray:
         """Return the positions of a term's own and borrowed parameters."""
         index = self.parameters.index
         names = [p.name for p in term.parameters] + list(term.borrows)
@@ -250,19 +281,22 @@ def build_network(
     extra = tuple(node for effect in effects for node in effect.extra_nodes(bare))
     layout = Layout(spec, bare.nodes + tuple(node.name for node in extra), bare.boundaries, knots)
     additions = [effect.addition(layout) for effect in effects]
-    terms = (*_declared_terms(layout), *(t for a in additions for t in a.terms))
+    terms = (*declared_terms(layout), *(t for a in additions for t in a.terms))
     capacities = tuple(c for a in additions for c in a.capacities)
     readings = tuple(r for a in additions for r in a.readings)
+    surroundings = tuple(sorted((b for a in additions for b in a.boundaries), key=lambda term: term.rank))
     parameters: list[Parameter] = [
         _quantity(f"C:{node.id}", "J/K", node.capacity_J_per_K, 1.0e4) for node in spec.nodes
     ]
     parameters += [
-        real(f"T:{name}", "K", b.guess_K, prior_std=50.0)
+        real(f"T:{name}", "K", b.guess_K, prior_std=b.spread or SINK_STD_K)
         for name, b in spec.boundaries.items()
         if b.guess_K is not None
     ]
+    units = {tie[0]: unit for _, tie, unit in spec.ties}
+    parameters += [_quantity(name, units[name], shared, 1.0) for name, shared in spec.parameters.items()]
     parameters += [node.capacity for node in extra]
-    for group in (terms, capacities, readings):
+    for group in (terms, capacities, readings, surroundings):
         parameters += [p for term in group for p in term.parameters]
     unique = tuple({p.name: p for p in parameters}.values())
     reads = {node.reads: layout.node(node.name) for node in extra if node.reads is not None}
@@ -278,10 +312,11 @@ def build_network(
         np.array(sensor_node, dtype=np.int64),
         extra,
         next((a.dated for a in additions if a.dated is not None), None),
+        surroundings,
     )
 
 
-def _declared_terms(layout: Layout) -> list[Term]:
+def declared_terms(layout: Layout) -> list[Term]:
     """Return the terms of the specification."""
     spec = layout.spec
     terms: list[Term] = []

@@ -35,12 +35,20 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+Spread = Annotated[float, BeforeValidator(_not_boolean), Field(gt=1, le=1e6, allow_inf_nan=False)]
+"""The factor, up or down, that is one standard deviation of a guess."""
+
+
 class Quantity(Strict):
-    """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``)."""
+    """A positive quantity: known (``value``: held) or unknown (``guess``: calibrated, within optional ``bounds``).
+
+    A guess may say how far off it may be: ``spread`` is the factor of one standard deviation.
+    """
 
     value: Magnitude | None = None
     guess: Magnitude | None = None
     bounds: tuple[Positive, Positive] | None = None
+    spread: Spread | None = None
 
     @model_validator(mode="after")
     def _one_meaning(self) -> Self:
@@ -48,6 +56,8 @@ class Quantity(Strict):
             raise ValueError(
                 "give either 'value' (known, held) or 'guess' with optional 'bounds' (calibrated), not both"
             )
+        if self.spread is not None and self.guess is None:
+            raise ValueError("spread says how far a guess may be off; give 'guess' with it")
         if self.bounds is not None:
             low, high = self.bounds
             if not low < high:
@@ -55,6 +65,57 @@ class Quantity(Strict):
             if self.guess is not None and not low <= self.guess <= high:
                 raise ValueError(f"guess {self.guess:g} lies outside its bounds {low:g} to {high:g}")
         return self
+
+
+class Tied(Quantity):
+    """A quantity that may also be a known size times a shared unknown, which the specification lists under ``parameters``."""
+
+    @property
+    def tie(self) -> tuple[str, float] | None:
+        """The name of the shared unknown and the size that multiplies it; None where it stands alone."""
+        return None
+
+    def _one_tie(self, shared: str, size: str) -> None:
+        given = [name for name in (shared, size) if getattr(self, name) is not None]
+        if len(given) == 1:
+            raise ValueError(f"'{shared}' names a shared unknown and '{size}' what multiplies it; give both")
+        own = [name for name in ("value", "guess", "bounds", "spread") if getattr(self, name) is not None]
+        if given and own:
+            raise ValueError(f"give either '{shared}' with '{size}', or '{own[0]}', not both")
+
+
+class Conductance(Tied):
+    """A conductance in W/K, alone or as an area times a shared coefficient in W/m2/K."""
+
+    per_area: Name | None = None
+    area_m2: Magnitude | None = None
+
+    @model_validator(mode="after")
+    def _area_with_name(self) -> Self:
+        self._one_tie("per_area", "area_m2")
+        return self
+
+    @property
+    def tie(self) -> tuple[str, float] | None:
+        """The shared coefficient and the area."""
+        return None if self.per_area is None or self.area_m2 is None else (self.per_area, self.area_m2)
+
+
+class HeatCapacity(Tied):
+    """A capacity in J/K, alone or as a mass times a shared specific capacity in J/kg/K."""
+
+    per_mass: Name | None = None
+    mass_kg: Magnitude | None = None
+
+    @model_validator(mode="after")
+    def _mass_with_name(self) -> Self:
+        self._one_tie("per_mass", "mass_kg")
+        return self
+
+    @property
+    def tie(self) -> tuple[str, float] | None:
+        """The shared specific capacity and the mass."""
+        return None if self.per_mass is None or self.mass_kg is None else (self.per_mass, self.mass_kg)
 
 
 def guess_or(quantity: Quantity | None, default: float) -> float:

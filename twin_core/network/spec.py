@@ -6,12 +6,15 @@ from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, StrictBool, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from twin_core.errors import TelemetryError
 from twin_core.network.orbit_block import PREFIX, OrbitBlock
 from twin_core.network.quantities import (
     TWIN_ID,
+    Conductance,
     Fraction,
+    HeatCapacity,
     Magnitude,
     Name,
     Number,
@@ -22,6 +25,9 @@ from twin_core.network.quantities import (
 )
 from twin_core.units import parse_instant_ns
 
+REFERENCES = "references"
+"""The kind of a validation error that carries all broken references of a specification as ``problems``."""
+
 
 class Boundary(Strict):
     """A temperature that is given: a constant, a telemetry channel, or one unknown constant with a guess."""
@@ -29,11 +35,38 @@ class Boundary(Strict):
     value_K: Temperature | None = None
     channel: Name | None = None
     guess_K: Temperature | None = None
+    spread: Positive | None = None
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
+        if self.spread is not None and self.guess_K is None:
+            raise ValueError("spread says by how many K a guess may be off; give 'guess_K' with it")
         if sum(item is not None for item in (self.value_K, self.channel, self.guess_K)) != 1:
             raise ValueError("give exactly one of 'value_K', 'channel', 'guess_K'")
+        return self
+
+
+Ends = tuple[Number | None, Number | None]
+
+
+class Limits(Strict):
+    """Where a channel should stay (yellow) and must stay (red), in its own unit; null where a side has no limit."""
+
+    yellow: Ends | None = None
+    red: Ends | None = None
+
+    @model_validator(mode="after")
+    def _nested(self) -> Self:
+        for colour, ends in (("yellow", self.yellow), ("red", self.red)):
+            if ends is not None and ends == (None, None):
+                raise ValueError(f"{colour} limits nothing; give at least one end")
+            if ends is not None and None not in ends and not ends[0] < ends[1]:  # type: ignore[operator]
+                raise ValueError(f"{colour} limits contradict each other: {ends[0]:g} is not below {ends[1]:g}")
+        if self.yellow is None and self.red is None:
+            raise ValueError("give 'yellow', 'red' or both")
+        for inner, outer, word in zip(self.yellow or (), self.red or (), ("below", "above"), strict=False):
+            if inner is not None and outer is not None and (inner < outer if word == "below" else inner > outer):
+                raise ValueError(f"the yellow limit {inner:g} lies {word} the red one {outer:g}; yellow comes first")
         return self
 
 
@@ -45,6 +78,7 @@ class Channel(Strict):
     noise_std: Magnitude | None = None
     interpolation: Literal["hold", "linear"] | None = None
     levels: StrictBool = False
+    limits: Limits | None = None
 
     @model_validator(mode="after")
     def _unit_fits_kind(self) -> Self:
@@ -72,7 +106,7 @@ class Node(Strict):
 
     id: Name
     sensor: Name | tuple[Name, ...] | None = None
-    capacity_J_per_K: Quantity | None = None
+    capacity_J_per_K: HeatCapacity | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -86,7 +120,7 @@ class Conductor(Strict):
     """A symmetric linear coupling GL (W/K) between two nodes, or a node and a boundary."""
 
     between: tuple[Name, Name]
-    conductance_W_per_K: Quantity | None = None
+    conductance_W_per_K: Conductance | None = None
 
     @field_validator("between")
     @classmethod
@@ -156,11 +190,30 @@ class Interval(Strict):
         return self
 
 
+class SensorCriteria(Strict):
+    """Correlation acceptance of one sensor; what is left out is that of all."""
+
+    bias_K: Positive | None = None
+    std_K: Positive | None = None
+    q99_abs_K: Positive | None = None
+
+
 class Criteria(Strict):
-    """Correlation acceptance. The defaults are the usual test-correlation goals: 2 K of bias, 5 K for 99 % of samples."""
+    """Correlation acceptance. The defaults are the usual test-correlation goals: 2 K of bias, 5 K for 99 % of samples.
+
+    The standard deviation of the error is judged where a limit is given; ``per_sensor`` gives some sensors their own limits.
+    """
 
     bias_K: Positive = 2.0
+    std_K: Positive | None = None
     q99_abs_K: Positive = 5.0
+    per_sensor: dict[Name, SensorCriteria] = Field(default_factory=dict)
+
+    def of(self, sensor: str) -> dict[str, float]:
+        """Return the limits of a sensor: bias_K, q99_abs_K, and std_K where there is one."""
+        common = self.model_dump(include={"bias_K", "std_K", "q99_abs_K"}, exclude_none=True)
+        own = self.per_sensor.get(sensor)
+        return common if own is None else common | own.model_dump(exclude_none=True)
 
 
 class TwinSpec(Strict):
@@ -175,16 +228,18 @@ class TwinSpec(Strict):
     loads: tuple[Load, ...] = ()
     exclude: tuple[Interval, ...] = ()
     criteria: Criteria = Criteria()
+    parameters: dict[Name, Quantity] = Field(default_factory=dict)
     orbit: OrbitBlock | None = None
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
-        for problem in self._problems():
-            raise ValueError(problem)
+        problems = list(dict.fromkeys(self._problems()))
+        if problems:
+            raise PydanticCustomError(REFERENCES, "references", {"problems": problems})
         return self
 
     def _problems(self) -> Iterable[str]:
-        """Yield every broken reference, the first of which becomes the message."""
+        """Yield every broken reference; the first becomes the headline."""
         nodes = [node.id for node in self.nodes]
         yield from (f"nodes[{i}].id: '{n}' is declared twice" for i, n in enumerate(nodes) if n in nodes[:i])
         yield from (f"boundaries.{name}: a node has the same id" for name in self.boundaries if name in nodes)
@@ -211,6 +266,42 @@ class TwinSpec(Strict):
                 yield f"radiators[{i}]: '{radiator.node}' radiates to '{radiator.sink}' twice; add the areas"
         yield from self._check_orbit()
         yield from self._check_loads(nodes)
+        yield from self._check_shared()
+        for sensor in self.criteria.per_sensor:
+            if sensor not in seen:
+                yield f"criteria.per_sensor.{sensor}: reads no node (sensors: {', '.join(seen) or 'none'})"
+
+    def _check_shared(self) -> Iterable[str]:
+        """Check the shared unknowns: each is used, by quantities of one kind, and has a size to start from."""
+        used: dict[str, str] = {}
+        for field, tie, unit in self.ties:
+            if tie[0] not in self.parameters:
+                known = ", ".join(self.parameters) or "none"
+                yield f"{field}: unknown parameter '{tie[0]}'; declare it under parameters (known: {known})"
+            elif used.setdefault(tie[0], unit) != unit:
+                yield f"{field}: '{tie[0]}' is in {used[tie[0]]} elsewhere and would be in {unit} here; give it another name"
+        for name, quantity in self.parameters.items():
+            if ":" in name or "." in name:
+                yield f"parameters.{name}: a shared unknown has neither ':' nor '.' in its name"
+            if quantity.guess is None and quantity.value is None:
+                yield f"parameters.{name}: give a 'guess' that is calibrated, or a 'value' that is held"
+            if name not in used:
+                yield f"parameters.{name}: is used nowhere; name it as 'per_area' or 'per_mass', or remove it"
+
+    @property
+    def ties(self) -> list[tuple[str, tuple[str, float], str]]:
+        """Where shared unknowns are used: field, (name, size), and the unit that this makes the unknown's."""
+        masses = [
+            (f"nodes[{i}].capacity_J_per_K.per_mass", node.capacity_J_per_K.tie, "J/kg/K")
+            for i, node in enumerate(self.nodes)
+            if node.capacity_J_per_K is not None
+        ]
+        areas = [
+            (f"conductors[{i}].conductance_W_per_K.per_area", conductor.conductance_W_per_K.tie, "W/m2/K")
+            for i, conductor in enumerate(self.conductors)
+            if conductor.conductance_W_per_K is not None
+        ]
+        return [(field, tie, unit) for field, tie, unit in [*masses, *areas] if tie is not None]
 
     def _check_orbit(self) -> Iterable[str]:
         for name in () if self.orbit is None else self.orbit.units:
@@ -218,7 +309,7 @@ class TwinSpec(Strict):
                 yield f"channels.{name}: comes from the orbit; remove it, or declare no orbit"
         for name in self.attitude_channels:
             yield from self._check_channel("orbit.attitude.quaternion_channels", name, ("auxiliary",))
-            if self.channels[name].levels:
+            if name in self.channels and self.channels[name].levels:
                 yield f"orbit.attitude.quaternion_channels: channel '{name}' has levels; a quaternion has none"
 
     def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
@@ -244,7 +335,9 @@ class TwinSpec(Strict):
                 yield f"loads[{i}].solar: '{load.channel}' follows the Sun's distance already; leave it out"
             if (load.channel, load.node) in [(other.channel, other.node) for other in self.loads[:i]]:
                 yield f"loads[{i}]: channel '{load.channel}' heats node '{load.node}' twice; add the weights"
-            channel = self.inputs[load.channel]
+            channel = self.inputs.get(load.channel)
+            if channel is None or channel.kind == "temperature":
+                continue
             if load.table is None and channel.kind == "auxiliary":
                 yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
             if load.table is not None and channel.kind == "power":

@@ -1,7 +1,7 @@
 """Specifications as files and plain data, with one clear message for what is wrong."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,19 +10,40 @@ from pydantic import BaseModel, ValidationError
 
 from twin_core.errors import SpecError
 from twin_core.network.quantities import NAME, TWIN_ID
-from twin_core.network.spec import TwinSpec
+from twin_core.network.spec import REFERENCES, TwinSpec
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def _one_line(error: ValidationError) -> str:
-    """Return the first problem of a validation as ``field: what is wrong``."""
-    first = min(error.errors(), key=lambda item: item["type"] == "missing")
-    where = ""
-    for part in first["loc"]:
-        where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
-    message = _wording(first)
-    return f"{where}: {message}" if where else message
+def _in_words(error: ValidationError) -> list[str]:
+    """Return every problem of a validation as ``field: what is wrong``; missing fields come last.
+
+    A field that may be of several types has one problem per type, the first of which is told. What is wrong with a part is
+    not told of the whole once more.
+    """
+    found: dict[tuple[int | str, ...], list[str]] = {}
+    for item in sorted(error.errors(), key=lambda item: item["type"] == "missing"):
+        where = ""
+        for part in item["loc"]:
+            where += f"[{part}]" if isinstance(part, int) else f"{'.' if where else ''}{part}"
+        message = _wording(item)
+        lines = item["ctx"]["problems"] if item["type"] == REFERENCES else [f"{where}: {message}" if where else message]
+        found.setdefault(_field(item["loc"]), lines)
+    within = {field[:n] for field in found for n in range(len(field))}
+    return [line for field, lines in found.items() if field not in within for line in lines]
+
+
+def _field(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
+    """Return where a problem is, without the name of the type that was tried there."""
+    tried = (k for k, part in enumerate(loc) if k > 1 and isinstance(part, str) and _is_type(part))
+    return loc[: next(tried, len(loc))]
+
+
+def _is_type(part: str) -> bool:
+    return "[" in part or part in _TYPES_TRIED
+
+
+_TYPES_TRIED = ("str", "constrained-str", "float")
 
 
 _WORDING = {
@@ -127,7 +148,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
 
 
 def read_model(
-    source: Path | str | dict[str, Any], kind: type[Model], in_words: Callable[[ValidationError], str]
+    source: Path | str | dict[str, Any], kind: type[Model], in_words: Callable[[ValidationError], Sequence[str]]
 ) -> Model:
     """Return what a YAML or JSON file, or its parsed mapping, describes.
 
@@ -138,24 +159,27 @@ def read_model(
     kind
         What it should describe.
     in_words
-        Says in one line which field is wrong, and how.
+        Says in one line each which fields are wrong, and how.
 
     Raises
     ------
     SpecError
-        With one line that names the file and the field, and says what is wrong.
+        With one line that names the file and the first field, and says what is wrong; ``problems`` lists all.
     """
     prefix = "" if isinstance(source, dict) else f"{source}: "
     data = source if isinstance(source, dict) else read_mapping(Path(source))
     try:
         return kind.model_validate(data)
-    except (ValidationError, SpecError) as error:
-        raise SpecError(prefix + (in_words(error) if isinstance(error, ValidationError) else str(error))) from error
+    except ValidationError as error:
+        problems = in_words(error)
+        raise SpecError(prefix + problems[0], problems) from error
+    except SpecError as error:
+        raise SpecError(prefix + str(error), error.problems) from error
 
 
 def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
     """Return the validated specification from a YAML or JSON file, or from its parsed mapping; SpecError as above."""
-    return read_model(source, TwinSpec, _one_line)
+    return read_model(source, TwinSpec, _in_words)
 
 
 def dump_spec(spec: TwinSpec) -> dict[str, Any]:

@@ -31,6 +31,8 @@ class Along:
         (1 AU / Sun distance)^2; ones where no load is solar.
     derivatives
         Whether parameter derivatives are wanted: a term for which they are dear may leave them out where not.
+    given_K : (n_points, n_boundaries)
+        The boundaries as they are declared, where an effect has changed them; None where ``boundaries_K`` are those.
     """
 
     time_s: FloatArray
@@ -39,6 +41,12 @@ class Along:
     inputs: Mapping[str, FloatArray]
     sun_factor: FloatArray
     derivatives: bool = True
+    given_K: FloatArray | None = None
+
+    @property
+    def declared_K(self) -> FloatArray:
+        """The boundaries as they are declared, (n_points, n_boundaries)."""
+        return self.boundaries_K if self.given_K is None else self.given_K
 
 
 class Entry(NamedTuple):
@@ -185,6 +193,56 @@ class ReadingTerm(Protocol):
 
     def evaluate(self, time_s: FloatArray, values: FloatArray) -> Reading:
         """Return the offset and derivatives at the sample times, on the clock of ``Record.clock_s``."""
+        ...
+
+
+@dataclass(frozen=True)
+class Sink:
+    """What an effect makes of the temperature of one boundary, with its derivatives.
+
+    Attributes
+    ----------
+    temperature_K : (n_points,)
+        What everything that reads the boundary sees.
+    d_given : (n_points,)
+        Its derivative by the temperature that was there before.
+    d_values
+        (value index, (n_points,)).
+    d_states
+        (node, (n_points,)): where the temperature is that of a state.
+    """
+
+    temperature_K: FloatArray
+    d_given: FloatArray
+    d_values: list[tuple[int, FloatArray]] = field(default_factory=list)
+    d_states: list[tuple[int, FloatArray]] = field(default_factory=list)
+
+
+class BoundaryTerm(Protocol):
+    """A change of the temperature that a boundary has for all that reads it."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Its own parameters."""
+        ...
+
+    @property
+    def borrows(self) -> tuple[str, ...]:
+        """Names of network parameters that it needs too."""
+        ...
+
+    @property
+    def boundary(self) -> int:
+        """The boundary whose temperature it changes."""
+        ...
+
+    @property
+    def rank(self) -> int:
+        """Of several on one boundary the lower ones act first: a delay is one of the channel itself."""
+        ...
+
+    def evaluate(self, given_K: FloatArray, along: Along, values: FloatArray) -> Sink:
+        """Return the temperature and its derivatives, for the temperature (n_points,) that is there before."""
         ...
 
 

@@ -25,6 +25,8 @@ class Parameter:
         True where the value is known and held.
     guessed
         True where nobody declared a value, so that the data alone must tell.
+    tied_to, size
+        The parameter of which this one is ``size`` times the value; such a one is no unknown of its own. None for most.
     """
 
     name: str
@@ -34,6 +36,8 @@ class Parameter:
     prior_std: float | None = None
     frozen: bool = False
     guessed: bool = False
+    tied_to: str | None = None
+    size: float = 1.0
 
     @property
     def free(self) -> float:

@@ -16,6 +16,11 @@ class Transform(Protocol):
         ...
 
     @property
+    def highest(self) -> float:
+        """The free number above which there are no further values; infinite for most."""
+        ...
+
+    @property
     def leap(self) -> float:
         """The longest step of the free number in which a linearisation still tells something; infinite for most."""
         ...
@@ -38,6 +43,7 @@ class Identity:
     """value = free: a quantity of either sign."""
 
     lowest: ClassVar[float] = -np.inf
+    highest: ClassVar[float] = np.inf
     leap: ClassVar[float] = np.inf
 
     def to_value(self, free: float) -> float:
@@ -64,6 +70,7 @@ class Shifted:
     scale: float
 
     lowest: ClassVar[float] = -np.inf
+    highest: ClassVar[float] = np.inf
     leap: ClassVar[float] = 1.0
 
     def to_value(self, free: float) -> float:
@@ -80,24 +87,30 @@ class Shifted:
 
 
 @dataclass(frozen=True)
-class Floored:
-    """value = max(free, lower): a quantity that may reach its bound, as a share that falls to nothing does.
+class Bounded:
+    """value = free within bounds that it may reach, as a share that falls to nothing does.
 
-    The slope is one on the bound too, so that a standard deviation there is that of the quantity without its bound.
+    The slope is one on a bound too, so that a standard deviation there is that of the quantity without its bound.
     """
 
     lower: float
+    upper: float = np.inf
 
     leap: ClassVar[float] = np.inf
 
     @property
     def lowest(self) -> float:
-        """The bound."""
+        """The lower bound."""
         return self.lower
 
+    @property
+    def highest(self) -> float:
+        """The upper bound."""
+        return self.upper
+
     def to_value(self, free: float) -> float:
-        """Return the number, or the bound where it lies below."""
-        return max(free, self.lower)
+        """Return the number, or the bound beyond which it lies."""
+        return min(max(free, self.lower), self.upper)
 
     def to_free(self, value: float) -> float:
         """Return the value."""
@@ -113,6 +126,7 @@ class Log:
     """value = exp(free): a positive quantity of unknown order of magnitude."""
 
     lowest: ClassVar[float] = -np.inf
+    highest: ClassVar[float] = np.inf
     leap: ClassVar[float] = np.inf
 
     def to_value(self, free: float) -> float:
@@ -136,6 +150,7 @@ class LogInterval:
     upper: float
 
     lowest: ClassVar[float] = -np.inf
+    highest: ClassVar[float] = np.inf
     leap: ClassVar[float] = np.inf
 
     def _span(self) -> float:

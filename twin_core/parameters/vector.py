@@ -34,8 +34,22 @@ class ParameterSet:
 
     @cached_property
     def free_index(self) -> IntArray:
-        """Positions of the parameters that are not frozen, (n_free,)."""
-        return np.array([i for i, p in enumerate(self.parameters) if not p.frozen], dtype=np.int64)
+        """Positions of the parameters that are neither frozen nor tied to another, (n_free,)."""
+        own = [i for i, p in enumerate(self.parameters) if not p.frozen and p.tied_to is None]
+        return np.array(own, dtype=np.int64)
+
+    @cached_property
+    def ties(self) -> dict[int, tuple[int, float]]:
+        """Position of each tied parameter -> that of the one it follows, and the size by which it does."""
+        return {i: (self.index[p.tied_to], p.size) for i, p in enumerate(self.parameters) if p.tied_to is not None}
+
+    def _tied(self, values: FloatArray) -> FloatArray:
+        """Return values (n_parameters,) with those of tied parameters following theirs."""
+        if self.ties:
+            values = values.copy()
+            for i, (shared, size) in self.ties.items():
+                values[i] = size * values[shared]
+        return values
 
     @property
     def free_names(self) -> tuple[str, ...]:
@@ -64,6 +78,11 @@ class ParameterSet:
         return np.array([self.parameters[i].transform.lowest for i in self.free_index], dtype=np.float64)
 
     @property
+    def highest(self) -> FloatArray:
+        """Upper bounds of the free vector, (n_free,); infinite where there is none."""
+        return np.array([self.parameters[i].transform.highest for i in self.free_index], dtype=np.float64)
+
+    @property
     def leap(self) -> FloatArray:
         """Longest steps of the free vector at once, (n_free,); infinite where any will do."""
         return np.array([self.parameters[i].transform.leap for i in self.free_index], dtype=np.float64)
@@ -73,7 +92,7 @@ class ParameterSet:
         values = self.values
         for position, i in enumerate(self.free_index):
             values[i] = self.parameters[i].transform.to_value(float(free[position]))
-        return values
+        return self._tied(values)
 
     def slopes(self, free: FloatArray) -> FloatArray:
         """Return d value / d free of each free parameter, (n_free,)."""
@@ -87,12 +106,13 @@ class ParameterSet:
         return self.at_values(self.to_values(free))
 
     def at_values(self, values: FloatArray) -> "ParameterSet":
-        """Return the set with other physical values, (n_parameters,)."""
-        return ParameterSet(tuple(p.at(float(v)) for p, v in zip(self.parameters, values, strict=True)))
+        """Return the set with other physical values, (n_parameters,); tied ones follow theirs."""
+        return ParameterSet(tuple(p.at(float(v)) for p, v in zip(self.parameters, self._tied(values), strict=True)))
 
     def updated(self, values: Mapping[str, float]) -> "ParameterSet":
-        """Return the set with the named values replaced; names that it lacks are ignored."""
-        return ParameterSet(tuple(p.at(float(values.get(p.name, p.value))) for p in self.parameters))
+        """Return the set with the named values replaced; names that it lacks are ignored, tied ones follow theirs."""
+        named = np.array([values.get(p.name, p.value) for p in self.parameters], dtype=np.float64)
+        return self.at_values(named)
 
     def joined(self, more: Iterable[Parameter]) -> "ParameterSet":
         """Return the set with more parameters at its end."""

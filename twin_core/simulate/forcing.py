@@ -85,6 +85,15 @@ def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *,
     return filled[interval]
 
 
+def first_boundary_K(spec: TwinSpec, record: Record, boundary: str) -> float:
+    """Return the temperature of a boundary where a record begins; NaN for an unknown constant."""
+    declared = spec.boundaries[boundary]
+    if declared.channel is None:
+        return np.nan if declared.value_K is None else declared.value_K
+    first = np.zeros(1, dtype=np.int64)
+    return float(at_times(record, declared.channel, True, record.time_s[:1], interval=first)[0])
+
+
 MOST_STEPS = 20_000_000
 """Decades of minutes; each step costs some hundred bytes."""
 

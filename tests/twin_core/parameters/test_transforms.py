@@ -6,10 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.helpers import central_difference
-from twin_core.parameters.transforms import Floored, Identity, Log, LogInterval, Shifted, Transform, is_logarithmic
+from twin_core.parameters.transforms import Bounded, Identity, Log, LogInterval, Shifted, Transform, is_logarithmic
 
 INTERVAL = LogInterval(2.0e-3, 50.0)
-TRANSFORMS: tuple[Transform, ...] = (Identity(), Log(), INTERVAL, Shifted(40.0, 8.0), Floored(-30.0))
+TRANSFORMS: tuple[Transform, ...] = (Identity(), Log(), INTERVAL, Shifted(40.0, 8.0), Bounded(-30.0))
 each_transform = pytest.mark.parametrize("transform", TRANSFORMS, ids=lambda t: type(t).__name__)
 
 
@@ -70,8 +70,8 @@ def test_an_instant_keeps_its_microseconds_and_its_conditioning(seconds: float) 
 
 @given(free=st.floats(-1e6, 0.0))
 def test_a_floored_number_rests_on_its_bound_and_can_come_back(free: float) -> None:
-    assert Floored(0.0).to_value(free) == 0.0
-    assert Floored(0.0).slope(free) == 1.0
+    assert Bounded(0.0).to_value(free) == 0.0
+    assert Bounded(0.0).slope(free) == 1.0
 
 
 def test_what_moves_by_factors() -> None:
