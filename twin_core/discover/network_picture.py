@@ -56,6 +56,12 @@ def _ends(effect: Mapping[str, Any]) -> tuple[str, str] | None:
     return (where["node"], other) if "node" in where and other else None
 
 
+def _alone(effect: Mapping[str, Any]) -> str:
+    """Return the one node or boundary on which an effect acts."""
+    where = effect.get("where") or {}
+    return str(where.get("node") or where.get("boundary"))
+
+
 def _positions(names: Sequence[str], edges: Sequence[tuple[str, str]]) -> dict[str, tuple[float, float]]:
     """Place names so that drawn distances follow the number of edges between them.
 
@@ -131,7 +137,7 @@ def _effect(at: Mapping[str, tuple[float, float]], effect: Mapping[str, Any]) ->
     ends = _ends(effect)
     if ends is not None:
         return _line(at, *ends, "effect", "", bend=_EFFECT_BEND)
-    node = str((effect.get("where") or {}).get("node"))
+    node = _alone(effect)
     return _pill(at[node], node, "effect", 8.0) if node in at else ""
 
 
@@ -141,7 +147,7 @@ def _effect_label(at: Mapping[str, tuple[float, float]], effect: Mapping[str, An
     if ends is not None and ends[0] in at and ends[1] in at:
         spot, _ = _bow(at[ends[0]], at[ends[1]], _EFFECT_BEND)
         return _text(spot, name, "effect-label", 4.0)
-    node = str((effect.get("where") or {}).get("node"))
+    node = _alone(effect)
     return _text(at[node], name, "effect-label", -34.0) if ends is None and node in at else ""
 
 

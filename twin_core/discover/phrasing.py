@@ -83,7 +83,7 @@ def place(where: Mapping[str, Any]) -> str:
         node = rest.pop("node")
         parts.append(f"at {node}" if target is None else f"from {node} to {target}")
     elif target is not None:
-        parts.append(f"to {target}")
+        parts.append(f"at {target}")
     if "channel" in rest:
         parts.append(f"{'by' if parts else 'of'} channel {rest.pop('channel')}")
     return " ".join([*parts, *(f"of {key} {value}" for key, value in rest.items())])

@@ -63,8 +63,8 @@ class BoundaryLag(Effect):
     words = "follows its channel late"
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return the time constant; a lag of zero is none."""
-        return (Quality("tau_s", "s", null=0.0, positive=True),)
+        """Return the time constant; a lag of zero is none, one far longer than the record is a constant sink."""
+        return (Quality("tau_s", "s", null=0.0, positive=True, prior_std=3.0, open_ended=True),)
 
     @property
     def _state(self) -> str:

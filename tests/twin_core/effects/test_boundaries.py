@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from tests.analytic import SIGMA
 from tests.helpers import central_difference, every_term_network, model_of, points, record_of
 from twin_core.assimilate import assimilate
+from twin_core.calibrate.problem import build_segment
 from twin_core.calibrate.second_order import fit_network
 from twin_core.effects import REGISTRY, Effect, effect_from_json, effect_to_json
 from twin_core.effects.base import Survey, touched_nodes
@@ -219,8 +220,7 @@ def test_a_filter_carries_the_lag_on() -> None:
 def test_the_lag_starts_at_the_first_value_of_each_record() -> None:
     record = telemetry(60.0)
     record.values["T_room"][:3] = np.nan
-    problem, _ = fit_network(load_spec(DATA), [record_of(record.time_s, **dict(record.values))], [LAG])
-    (segment,) = problem.segments
+    segment = build_segment(network_of(LAG), record, 60.0)
     assert segment.start_prior_K[1] == pytest.approx(record.values["T_room"][3])
     assert segment.start_std_K[1] < 0.01
 
