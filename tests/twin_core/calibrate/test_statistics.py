@@ -53,6 +53,7 @@ def test_a_score_by_hand() -> None:
         "rmse_K": pytest.approx(0.5),
         "pcc": pytest.approx(1.0),
         "bias_K": pytest.approx(-0.5),  # measured - modelled
+        "std_K": pytest.approx(0.0),
         "q99_abs_K": pytest.approx(0.5),
     }
     assert found["per_sensor"]["B"]["bias_K"] == 0.0
