@@ -18,6 +18,7 @@ from twin_core.calibrate.problem import Problem, Segment
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
+from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along
 from twin_core.parameters.transforms import Identity, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
@@ -116,9 +117,9 @@ def _columns(problem: Problem, segment: Segment, n_windows: int) -> tuple[FloatA
     stages = np.repeat(after[:-1], counts, axis=0)
     flat = np.repeat(stages[:, None], 2, axis=1)
     boundaries = forcing.boundaries_flat_K(0, forcing.n_steps)
-    along: Along = forcing.along(
-        flat.reshape(-1, flat.shape[2]), fill_boundaries(network, values, boundaries), 0, forcing.n_steps
-    )
+    filled = fill_boundaries(network, values, boundaries)
+    points = forcing.along(flat.reshape(-1, flat.shape[2]), filled, 0, forcing.n_steps)
+    along: Along = surround(network, values, points).along
     window = np.minimum(np.arange(forcing.n_steps) * n_windows // max(forcing.n_steps, 1), n_windows - 1)
     n_nodes = len(network.nodes)
     design = np.zeros((n_windows, n_nodes, len(network.parameters)))

@@ -93,7 +93,7 @@ class BoundaryLag(Effect):
         """Yield time constants from two samples to the length of the record."""
         time_s = survey.along.time_s
         steps = np.diff(time_s)
-        shortest = 4.0 * float(np.median(steps[steps > 0]))
+        shortest = 2.0 * float(np.median(steps[steps > 0]))
         longest = max(float(time_s[s][-1] - time_s[s][0]) for s in survey.segments())
         for tau in np.geomspace(shortest, max(longest, 2.0 * shortest), N_TIME_CONSTANTS):
             yield cls(where, {"tau_s": 0.0}, {"start_s": float(tau)})

@@ -8,6 +8,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.effects.base import Beyond, Effect
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Network
+from twin_core.network.surroundings import surround
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.response import heat_response
 from twin_core.simulate.rollout import Rollout
@@ -30,7 +31,8 @@ def extrapolations(
         return []
     n_steps, n_nodes = forcing.n_steps, len(network.nodes)
     boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(0, n_steps))
-    along = forcing.along(path.stages_K.reshape(-1, n_nodes), boundaries, 0, n_steps)
+    points = forcing.along(path.stages_K.reshape(-1, n_nodes), boundaries, 0, n_steps)
+    along = surround(network, network.parameters.values, points).along
     found = [(effect, effect.beyond(network.layout, along)) for effect in effects]
     return [(effect, beyond) for effect, beyond in found if beyond is not None]
 

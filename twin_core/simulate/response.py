@@ -140,11 +140,12 @@ class _Switched:
         return heat
 
     def _free(self, index: int) -> tuple[int, float]:
-        """Return the position of a parameter among the free ones (-1 where held) and the slope of its transform."""
+        """Return the position of a parameter, or that it is tied to, among the free ones (-1 where held), and its slope."""
         parameters = self.split.network.parameters
-        found = np.flatnonzero(parameters.free_index == index)
-        parameter = parameters.at_values(self.split.values).parameters[index]
-        return (int(found[0]), parameter.transform.slope(parameter.free)) if found.size else (-1, 0.0)
+        shared, size = parameters.ties.get(index, (index, 1.0))
+        found = np.flatnonzero(parameters.free_index == shared)
+        parameter = parameters.at_values(self.split.values).parameters[shared]
+        return (int(found[0]), size * parameter.transform.slope(parameter.free)) if found.size else (-1, 0.0)
 
     @cached_property
     def _powers(self) -> list[tuple[int, float]]:

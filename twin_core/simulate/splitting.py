@@ -17,6 +17,7 @@ from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundarie
 from twin_core.network.jacobian import Jacobian
 from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
+from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along, Relay
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import Remainder
@@ -78,15 +79,22 @@ class Couplings:
 
 
 def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
-    """Return the couplings of a network; ``along`` has two points at least, with one temperature per node."""
+    """Return the couplings of a network; ``along`` has two points at least, with one temperature per node.
+
+    What reads a boundary that follows a state is none of them: it is evaluated along the trajectory.
+    """
+    around = surround(network, values, along)
     n_points, n = along.temperatures_K.shape
     linear, fourth, heat = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n_points, n))
     everywhere = tuple(range(n))
     relays, others = [], []
     for position, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
-        part = term.evaluate(along, values[index])
+        part = term.evaluate(around.along, values[index])
         if part.relay is not None:
             relays.append((position, part.relay))
+            continue
+        if around.by_state and any(around.by_state.get(e.item) for e in part.d_boundaries):
+            others.append(position)
             continue
         if part.fourth_W_per_K4 is None and part.d_temperature.shape[0] > 1:
             others.append(position)
@@ -308,7 +316,8 @@ def turning(
         if number in split.others or any(number == position for position, _ in split.relays):
             continue
         for item, parameter in enumerate(index.tolist()):
-            if parameter not in position:
+            shared, size = parameters.ties.get(parameter, (parameter, 1.0))
+            if shared not in position:
                 continue
             step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
             change = np.zeros_like(slope)
@@ -319,13 +328,14 @@ def turning(
                 block = np.ix_(part.nodes, part.nodes)
                 change[block] += sign / (2.0 * step) * part.d_temperature[0]
             if change.any():
-                found[parameter] = found.get(parameter, 0.0) + symmetric(change, slope)
+                found[shared] = found.get(shared, 0.0) + size * symmetric(change, slope)
     mine = symmetric(slope)
     for node, parameter in enumerate(network.capacity_index.tolist()):
-        if parameter in position and mine[node].any():
+        shared, size = parameters.ties.get(parameter, (parameter, 1.0))
+        if shared in position and mine[node].any():
             change = np.zeros_like(slope)
-            change[node] = -mine[node] / own[node]
-            found[parameter] = found.get(parameter, 0.0) + change
+            change[node] = -size * mine[node] / own[node]
+            found[shared] = found.get(shared, 0.0) + change
     turned = np.array([position[p] for p in found], dtype=np.int64)
     slopes = [at.parameters[p].transform.slope(at.parameters[p].free) for p in found]
     n = own.size

@@ -293,16 +293,20 @@ def test_the_response_at_an_assumed_lag_is_that_of_the_lag() -> None:
     assert taus[0] < 100.0 and taus[-1] > 10000.0
     for start in starts:
         ((column,),) = start.unit_heats(survey)
-        tau, time_s = start.settings["start_s"], along.time_s
-        follows = solve_ivp(
-            lambda t, r, tau=tau, s=time_s: (np.interp(t, s, boundaries[:, 0]) - r) / tau,
-            (time_s[0], time_s[-1]),
-            boundaries[:1, 0],
-            t_eval=time_s,
-            rtol=1e-9,
-            atol=1e-9,
-            max_step=20.0,
-        ).y[0]
+        tau, (time_s, first, back) = (
+            start.settings["start_s"],
+            np.unique(along.time_s, return_index=True, return_inverse=True),
+        )
+        room = boundaries[first, 0]
+
+        def rate(
+            t: float, r: np.ndarray, tau: float = tau, at: np.ndarray = time_s, room: np.ndarray = room
+        ) -> np.ndarray:
+            return (np.interp(t, at, room) - r) / tau
+
+        span = (time_s[0], time_s[-1])
+        lagged = solve_ivp(rate, span, room[:1], t_eval=time_s, rtol=1e-9, atol=1e-9, max_step=20.0).y[0]
+        follows = lagged[back]
         np.testing.assert_allclose(tau * column[1], LEAK * (follows - boundaries[:, 0]), atol=1e-5)
 
 
