@@ -1,5 +1,7 @@
 """Where a calibration starts: levels, interpolated temperatures, and the order of magnitude of what nobody guessed."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -13,6 +15,7 @@ from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
+from twin_core.telemetry_csv import read_csv
 
 
 def test_levels_are_where_a_channel_rests() -> None:
@@ -125,3 +128,30 @@ def test_random_networks_are_found_from_any_subset_of_guesses(seed: int) -> None
     """Power over ten decades, 2 to 7 nodes; the truth is integrated by Runge and Kutta's method. All 500: benchmarks.starts."""
     case, outcome = attempt(1000 + seed)
     assert outcome.found, (case.kind, outcome)
+
+
+TEMPERATURE_LAB = Path(__file__).resolve().parents[4] / "shared" / "data" / "tclab_notre_dame"
+
+
+@pytest.mark.skipif(not TEMPERATURE_LAB.is_dir(), reason="the temperature lab's runs are not here")
+@pytest.mark.parametrize("run", ["step50_run1", "sine300s_run2", "sine50s_run3"])
+def test_the_temperature_lab_starts_from_a_guessed_gain_alone(run: str) -> None:
+    spec = load_spec(
+        {
+            "twin": "lab",
+            "boundaries": {"room": {"guess_K": 296.0}},
+            "channels": {
+                "T1_degC": {"kind": "temperature", "unit": "degC"},
+                "T2_degC": {"kind": "temperature", "unit": "degC"},
+                "Q1_percent": {"kind": "power", "unit": "percent"},
+            },
+            "nodes": [{"id": "a", "sensor": "T1_degC"}, {"id": "b", "sensor": "T2_degC"}],
+            "conductors": [{"between": pair} for pair in (["a", "b"], ["a", "room"], ["b", "room"])],
+            "loads": [{"channel": "Q1_percent", "node": "a", "gain": {"guess": 0.032}}],
+        }
+    )
+    model = calibrate(spec, [read_csv(TEMPERATURE_LAB / f"{run}.csv", spec)])
+    gain = model.values["gain:Q1_percent|a"]
+    assert abs(np.log(gain / 0.032)) < 1.0  # the guess sets the scale, within its spread
+    assert 0.5 < model.values["C:a"] / gain / (6.0 / 0.032) < 2.0  # published: 6 J/K at 0.032 W/%
+    assert 0.5 < model.values["G:a|room"] / gain / (0.042 / 0.032) < 2.0  # published: 0.042 W/K
