@@ -12,7 +12,6 @@ from threadpoolctl import threadpool_limits
 from torchdiffeq import odeint
 
 from benchmarks.markdown import TABLES, markdown_table
-from benchmarks.paper_a_cases import simulations
 from benchmarks.paper_a_speed import seconds
 from twin_core._typing import FloatArray
 from twin_core.calibrate.neural_ode import Recipe, Trainer
@@ -154,7 +153,7 @@ def growth() -> str:
     """Return how the cost of a rollout grows with samples, nodes and conductors, and memory at a million samples."""
     from matplotlib.figure import Figure  # the table of rollouts does without
 
-    record, network = simulations()["combined", "A"].record, build_network(paper_spec())
+    record, network = _problem("smooth").segments[0].record, build_network(paper_spec())
     long = (build_problem(network, [_repeated(record, n)], np.full(9, 0.1), np.inf) for n in SAMPLES)
     by_samples = [_rollout_seconds(problem, 1 if n > 1e5 else 3) for n, problem in zip(SAMPLES, long, strict=True)]
     by_size = [_rollout_seconds(_random_problem(nodes, edges, 1000), 3) for nodes, edges in SIZES]
@@ -198,7 +197,7 @@ def _growth(axes: "Axes", of: str, sizes: Sequence[int], taken: Sequence[float])
 def _repeated(record: Record, n_times: int) -> Record:
     """Return a record of any length: its inputs over and over."""
     index = np.arange(n_times) % record.time_s.size
-    return Record(20.0 * np.arange(n_times), {name: c[index] for name, c in record.values.items()})
+    return Record(SAMPLE_S * np.arange(n_times), {name: c[index] for name, c in record.values.items()})
 
 
 def _random_problem(n_nodes: int, n_edges: int, n_times: int) -> Problem:

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.simulate.matrices import factorise, multiply, solve_columns
+from twin_core.simulate.matrices import factorise, multiply, multiply_turned, solve_columns
 from twin_core.simulate.modes import Modes, dense, weights
 from twin_core.simulate.relays import N_KICK, Relays, is_recalled, shares_before, switch
 
@@ -26,6 +26,8 @@ STEP_K = 1e-10
 N_FIXED, N_NEWTON = 6, 40
 CONTRACTION = 0.3
 """Fixed-point iterations that contract less than this, or take more, give way to Newton's method."""
+LEAST_CONTRACTION = 1e-4
+"""One that was better by chance promises no more than this for the next step."""
 
 
 class Remainder(NamedTuple):
@@ -128,7 +130,8 @@ def march(
     begin, end, pushed, shares = np.empty(n), np.empty(n), np.empty(n), np.empty(n_relays)
     state, mode = starts[0].copy(), np.empty(n)
     multiply(modes.inward, state, mode)
-    at_s, dense_s, bad = np.nan, np.nan, n_steps
+    at_s, dense_s, bad, contraction = np.nan, np.nan, n_steps, 1.0
+    inward, outward, right = modes.inward.T.copy(), modes.outward.T.copy(), np.empty(n)
     for k in range(n_steps):
         if not chained:
             state[:] = starts[k]
@@ -137,6 +140,7 @@ def march(
         if step_s[k] != at_s:
             at_s = step_s[k]
             weights(at_s, modes.rate_per_s, keep, whole, late)
+            contraction = 1.0
         out[k, 0] = state
         for i in range(n):
             ahead[i] = state[i] + guess_share * moved[i]
@@ -149,10 +153,12 @@ def march(
                 begin[relays.node[r]] += relays.rate[r] * kicks[k, r, 0]
                 end[relays.node[r]] += relays.rate[r] * kicks[k, r, 1]
             _remainder(left, k, 0, begin, state, pushed)
-            multiply(modes.inward, pushed, first_g)
+            multiply_turned(inward, pushed, first_g)
             for i in range(n):
                 base[i] = whole[i] * (modes.rate_per_s[i] * mode[i] + first_g[i]) - late[i] * first_g[i]
-            settled = _fixed_point(modes, left, k, late, end, state, base, ahead, pushed)
+            settled, contraction = _fixed_point(
+                inward, outward, left, k, late, end, state, base, contraction, ahead, pushed, right
+            )
             if not settled:
                 if at_s != dense_s:
                     dense_s = at_s
@@ -198,37 +204,44 @@ def march(
 
 @njit(cache=True, nogil=True)
 def _fixed_point(
-    modes: Modes,
+    inward: FloatArray,
+    outward: FloatArray,
     left: Remainder,
     k: int,
     late: FloatArray,
     given: FloatArray,
     state: FloatArray,
     base: FloatArray,
+    contraction: float,
     ahead: FloatArray,
     pushed: FloatArray,
-) -> bool:
-    """Correct the end of step k until it rests; False where that takes long. ``pushed`` is how far its modes have moved."""
-    n = state.size
-    right, change, before = np.empty(n), np.inf, np.inf
+    right: FloatArray,
+) -> tuple[bool, float]:
+    """Correct the end of step k until it rests; return whether it does and by how much an iteration contracts.
+
+    ``contraction`` is that of the step before (1 where unknown): it hardly moves. ``inward`` and ``outward`` are transposed;
+    ``pushed`` is how far the modes have moved.
+    """
+    n, before = state.size, 0.0
     alone = left.linear.size + left.fourth.size + left.moving_row.size == 0
     for iteration in range(N_FIXED):
         _remainder(left, k, 1, given, ahead, right)
-        multiply(modes.inward, right, pushed)
+        multiply_turned(inward, right, pushed)
         for i in range(n):
             pushed[i] = base[i] + late[i] * pushed[i]
-        multiply(modes.outward, pushed, right)
+        multiply_turned(outward, pushed, right)
         change = 0.0
         for i in range(n):
             change = max(change, abs(state[i] + right[i] - ahead[i]))
             ahead[i] = state[i] + right[i]
-        contraction = 1.0 if iteration == 0 else (change / before if before > 0.0 else 0.0)
+        if iteration > 0:
+            contraction = max(change / before, LEAST_CONTRACTION) if before > 0.0 else LEAST_CONTRACTION
         if alone or change * min(contraction, 1.0) < STEP_K:
-            return True
-        if not (iteration == 0 or contraction < CONTRACTION):
-            return False
+            return True, contraction
+        if iteration > 0 and not contraction < CONTRACTION:
+            return False, 1.0
         before = change
-    return False
+    return False, 1.0
 
 
 @njit(cache=True, nogil=True)

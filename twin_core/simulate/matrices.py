@@ -66,6 +66,17 @@ def multiply(matrix: FloatArray, column: FloatArray, out: FloatArray) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def multiply_turned(transposed: FloatArray, column: FloatArray, out: FloatArray) -> None:
+    """Write matrix @ column to ``out``, the matrix given by its transpose: sums of rows need no horizontal additions."""
+    for i in range(out.size):
+        out[i] = transposed[0, i] * column[0]
+    for j in range(1, column.size):
+        factor = column[j]
+        for i in range(out.size):
+            out[i] += transposed[j, i] * factor
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def multiply_columns(matrix: FloatArray, columns: FloatArray, out: FloatArray) -> None:
     """Write matrix @ columns to ``out``."""
     out[:] = 0.0

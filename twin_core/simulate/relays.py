@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import numpy as np
 from numba import njit
 
 from twin_core._typing import FloatArray, IntArray
@@ -33,6 +34,8 @@ class Relays(NamedTuple):
     on: FloatArray
     approach: FloatArray
 
+
+NO_RELAYS = Relays(*(np.zeros(0, dtype=np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(6)))
 
 N_KICK = 22
 """Columns of what ``march`` tells of each relay and step: its shares of full power at the begin and the end of the step; the

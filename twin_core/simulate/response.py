@@ -18,7 +18,7 @@ from twin_core.simulate.derivatives import march_sensitivities
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.modes import Modes
 from twin_core.simulate.one_step import take_steps
-from twin_core.simulate.relays import N_KICK, Relays
+from twin_core.simulate.relays import N_KICK, NO_RELAYS, Relays
 from twin_core.simulate.rollout import Rollout
 from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, symmetric, turning
 from twin_core.simulate.stages import balance_along
@@ -222,7 +222,7 @@ def heat_response(
         nothing,
         np.zeros((0, n_nodes, n_nodes)),
         np.zeros((forcing.n_steps, 2, n_nodes)),
-        Relays(nothing, nothing, *(np.zeros(0) for _ in range(6))),
+        NO_RELAYS,
         np.zeros((forcing.n_steps, 0, N_KICK)),
         np.zeros((4, 0), dtype=np.int64),
         np.zeros((4, 0)),

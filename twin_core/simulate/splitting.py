@@ -18,11 +18,11 @@ from twin_core.network.jacobian import Jacobian
 from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.network.surroundings import surround
-from twin_core.network.terms import Along, Relay
+from twin_core.network.terms import Along, ChannelLoad, Conductors, Relay, TableLoad
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import Remainder
 from twin_core.simulate.modes import Modes
-from twin_core.simulate.relays import Relays
+from twin_core.simulate.relays import NO_RELAYS, Relays
 
 STRETCH = 1024
 """Steps that are taken together, and after which A is renewed where temperatures have moved."""
@@ -126,8 +126,10 @@ def symmetric(slope_W_per_K: FloatArray, like: FloatArray | None = None) -> Floa
     A reading that follows its node one way, say, is left to the corrector, which takes it as a given that changes over
     the step. ``like`` decides where this is a derivative of that.
     """
-    size = np.abs(slope_W_per_K if like is None else like)
     sign = slope_W_per_K if like is None else like
+    if np.array_equal(sign, sign.T) and (like is None or np.array_equal(slope_W_per_K, slope_W_per_K.T)):
+        return slope_W_per_K
+    size = np.abs(sign)
     own = size <= size.T
     out = np.where(own, slope_W_per_K, slope_W_per_K.T)
     out = np.where(size == size.T, 0.5 * (slope_W_per_K + slope_W_per_K.T), out)
@@ -212,6 +214,8 @@ class Split:
     @cached_property
     def relays(self) -> Relays:
         """The relays, their thresholds in enthalpy."""
+        if not self.parts.relays:
+            return NO_RELAYS
         found = [relay for _, relay in self.parts.relays]
         nodes = np.array([r.node for r in found], dtype=np.int64)
         low, high = (self.thresholds(name)[0] for name in ("on_K", "off_K"))
@@ -319,14 +323,18 @@ def turning(
             shared, size = parameters.ties.get(parameter, (parameter, 1.0))
             if shared not in position:
                 continue
-            step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
             change = np.zeros_like(slope)
-            for sign in (1.0, -1.0):
-                moved = values[index].copy()
-                moved[item] += sign * step
-                part = term.evaluate(along, moved)
-                block = np.ix_(part.nodes, part.nodes)
-                change[block] += sign / (2.0 * step) * part.d_temperature[0]
+            if isinstance(term, Conductors):  # by far the most, and linear
+                a, b = term.pairs[item]
+                change[[a, a, b, b], [a, b, a, b]] = (-1.0, 1.0, 1.0, -1.0)
+            elif not isinstance(term, ChannelLoad | TableLoad):
+                step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
+                for sign in (1.0, -1.0):
+                    moved = values[index].copy()
+                    moved[item] += sign * step
+                    part = term.evaluate(along, moved)
+                    block = np.ix_(part.nodes, part.nodes)
+                    change[block] += sign / (2.0 * step) * part.d_temperature[0]
             if change.any():
                 found[shared] = found.get(shared, 0.0) + size * symmetric(change, slope)
     mine = symmetric(slope)

@@ -7,12 +7,11 @@ from scipy.linalg import expm
 from twin_core.simulate.derivatives import march_sensitivities, transitions
 from twin_core.simulate.kernels import Remainder, march
 from twin_core.simulate.modes import Modes, phi
-from twin_core.simulate.relays import N_KICK, Relays
+from twin_core.simulate.relays import N_KICK, NO_RELAYS
 from twin_core.simulate.splitting import modes_of
 
 N, N_STEPS = 4, 12
 LOW, HIGH = np.full(N, -1e9), np.full(N, 1e9)
-NO_RELAYS = Relays(*(np.zeros(0, dtype=np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(6)))
 NO_KICKS = np.zeros((N_STEPS, 0, N_KICK))
 
 
