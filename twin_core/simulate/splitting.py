@@ -137,9 +137,13 @@ def symmetric(slope_W_per_K: FloatArray, like: FloatArray | None = None) -> Floa
 
 
 def modes_of(slope_W_per_K: FloatArray, capacity_J_per_K: FloatArray) -> Modes:
-    """Return the modes of A = slope / C for a symmetric slope."""
+    """Return the modes of A = slope / C for a symmetric slope; NaN where a search has left what floats can hold."""
     root = np.sqrt(capacity_J_per_K)
-    rate, vectors = np.linalg.eigh(slope_W_per_K / (root[:, None] * root))
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        scaled = slope_W_per_K / (root[:, None] * root)
+    if not np.isfinite(scaled).all():
+        return Modes(*(np.full(shape, np.nan) for shape in (root.shape, scaled.shape, scaled.shape)))
+    rate, vectors = np.linalg.eigh(scaled)
     return Modes(rate, np.ascontiguousarray(vectors / root[:, None]), np.ascontiguousarray(vectors.T * root))
 
 

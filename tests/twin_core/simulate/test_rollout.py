@@ -218,6 +218,18 @@ def test_an_impossible_balance_is_a_status_not_an_exception(power_W: float) -> N
     assert np.isnan(path.stages_K[-1]).all()
 
 
+@pytest.mark.parametrize("value", [np.inf, np.nan, 1e308])
+def test_numbers_beyond_floats_are_a_status_not_an_exception(value: float) -> None:
+    network = radiating()
+    forcing = build_forcing(network, record_of(60.0 * np.arange(40), Q=10.0), np.inf)
+    for name in ("C:n0", "G:n0|n1", "R:n1|space"):
+        values = network.parameters.values
+        values[network.parameters.index[name]] = 1.0 / value if name == "C:n0" else value
+        with np.errstate(all="ignore"):
+            assert not rollout(network, values, np.array([280.0, 270.0]), forcing).converged
+    assert not rollout(network, network.parameters.values, np.array([280.0, np.nan]), forcing).converged
+
+
 def test_no_steps_leave_the_start() -> None:
     network = chain()
     forcing = build_forcing(network, record_of(np.array([5.0]), Q=1.0), np.inf)
