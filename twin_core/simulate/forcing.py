@@ -54,11 +54,11 @@ class Forcing:
         return int(self.step_s.size)
 
     def boundaries_flat_K(self, first: int, last: int) -> FloatArray:
-        """Return the boundaries at the stages of steps first..last-1, (2 n_steps, n_boundaries): there may be none."""
+        """Return the boundaries at both ends of steps first..last-1, (2 n_steps, n_boundaries): there may be none."""
         return self.boundaries_K[first:last].reshape(2 * (last - first), self.boundaries_K.shape[2])
 
     def along(self, temperatures_K: FloatArray, boundaries_K: FloatArray, first: int, last: int) -> Along:
-        """Return the stage points of steps first..last-1 flattened to (2 n_steps, ...), at given temperatures."""
+        """Return both ends of steps first..last-1 flattened to (2 n_steps, ...), at given temperatures."""
         window = slice(first, last)
         return Along(
             self.stage_time_s[window].ravel() + self.epoch_s,
@@ -70,7 +70,7 @@ class Forcing:
 
 
 def at_times(record: Record, channel: str, is_held: bool, time_s: FloatArray, *, interval: IntArray) -> FloatArray:
-    """Return a channel at the stages: the sample that opens their interval where held, else interpolated.
+    """Return a channel at both ends of steps: the sample that opens their interval where held, else interpolated.
 
     Missing samples hold the last one (or are bridged by interpolation); before the first sample its value is taken.
     """
@@ -170,7 +170,7 @@ def _driving_channels(spec: TwinSpec, record: Record) -> tuple[str, ...]:
 
 
 def _sun_factor(spec: TwinSpec, record: Record, time_s: FloatArray) -> FloatArray:
-    """Return (1 AU / Sun distance)^2 at the stages; ones where nothing is solar."""
+    """Return (1 AU / Sun distance)^2 at both ends of steps; ones where nothing is solar."""
     if not any(load.solar for load in spec.loads):
         return np.ones_like(time_s)
     if record.epoch_ns is None:
