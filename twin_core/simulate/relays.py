@@ -35,7 +35,8 @@ class Relays(NamedTuple):
     approach: FloatArray
 
 
-NO_RELAYS = Relays(*(np.zeros(0, dtype=np.int64) for _ in range(2)), *(np.zeros(0) for _ in range(6)))
+_NOTHING, _NOWHERE = np.zeros(0), np.zeros(0, dtype=np.int64)
+NO_RELAYS = Relays(_NOWHERE, _NOWHERE, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 N_KICK = 22
 """Columns of what ``march`` tells of each relay and step: its shares of full power at the begin and the end of the step; the
