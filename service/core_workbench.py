@@ -103,7 +103,7 @@ class CoreWorkbench:
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""
-        from twin_core.forecast import forecast
+        from twin_core.forecast import WHOLE, forecast
         from twin_core.units import from_si
 
         model = _cached_model(document)
@@ -114,11 +114,13 @@ class CoreWorkbench:
             task.horizon_s,
             step_s=task.step_s,
             plan=None if task.plan is None else _record(spec, task.plan),
+            inputs=task.inputs,
+            past=None if task.past is None else _record(spec, task.past),
             quantiles=task.quantiles,
             state=task.state,
         )
 
-        if not all(np.isfinite(values).all() for values in (ahead.mean_K, *ahead.quantiles_K.values())):
+        if not all(np.isfinite(values).all() for values in (ahead.mean_K, *ahead.quantiles_K.values(), *ahead.whole_K)):
             raise ModelError("the forecast is not finite; recalibrate, or activate another model")
 
         def columns(values: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
@@ -126,7 +128,9 @@ class CoreWorkbench:
 
         time_us = task.telemetry.epoch_us + np.rint(ahead.time_s * 1e6).astype(np.int64)
         quantiles = {q: columns(values) for q, values in ahead.quantiles_K.items()}
-        return Forecasted(time_us, columns(ahead.mean_K), quantiles, ahead.notices)
+        low, high = (columns(end) for end in ahead.whole_K)
+        whole = {name: (low[name], high[name]) for name in ahead.sensors}
+        return Forecasted(time_us, columns(ahead.mean_K), quantiles, ahead.notices, whole, WHOLE, ahead.inputs)
 
     def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
         """Return temperatures and heat flows of the moment that the state describes."""

@@ -10,6 +10,7 @@ Instant = str
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 JobKind = Literal["calibration", "diagnosis"]
+Inputs = Literal["auto", "repeat", "hold"]
 Source = Literal["calibration", "diagnosis", "manual"]
 
 
@@ -189,22 +190,40 @@ class ModelList(_Answer):
 
 
 class ForecastRequest(_Request):
-    """How far to look ahead, and what the inputs will do; inputs without a plan hold their last value."""
+    """How far to look ahead, and what the inputs will do.
+
+    Without a plan ``auto`` repeats the last period of an input that has one and holds the others; ``repeat`` repeats and
+    ``hold`` holds all of them. What comes from the orbit is computed.
+    """
 
     horizon_s: Positive
     step_s: Positive | None = None
     plan: Columns | None = None
+    inputs: Inputs = "auto"
     quantiles: list[Share] = Field(default=[0.05, 0.5, 0.95], min_length=1, max_length=20)
 
 
+class Whole(_Answer):
+    """Simultaneous bands: every reading of a sensor lies between its ``low`` and ``high`` with this probability."""
+
+    probability: float
+    values: dict[str, dict[str, list[float]]]
+
+
 class Forecast(_Answer):
-    """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit."""
+    """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit.
+
+    ``inputs`` says where the future of each input and boundary channel comes from, ``behind_s`` by how many seconds of
+    telemetry the state that the forecast starts from lags behind the archive.
+    """
 
     model_version: int
     issued: Instant
     time: list[Instant]
     values: dict[str, dict[str, list[float]]]
+    whole: Whole | None = None
     units: dict[str, str | None]
+    inputs: dict[str, Literal["plan", "orbit", "repeat", "hold"]] = {}
     notices: list[str] = []
 
 

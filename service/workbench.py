@@ -3,13 +3,14 @@
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Progress = Callable[[float, str], None]
 Json = dict[str, Any]
+Inputs = Literal["auto", "repeat", "hold"]
 Masks = Mapping[str, Mapping[str, NDArray[np.bool_]]]
 """Channel -> reason -> which samples are no readings, (n_times,)."""
 
@@ -100,7 +101,10 @@ class Filtered:
 
 @dataclass(frozen=True)
 class ForecastTask:
-    """Forecast from the end of ``telemetry``, the filter starting there in ``state`` if there is one."""
+    """Forecast from the end of ``telemetry``, the filter starting there in ``state`` if there is one.
+
+    ``past`` is what the driving channels did before, ``inputs`` says what those without a plan are taken to do.
+    """
 
     telemetry: Telemetry
     state: Json | None
@@ -108,16 +112,25 @@ class ForecastTask:
     step_s: float | None
     plan: Telemetry | None
     quantiles: tuple[float, ...]
+    inputs: Inputs = "auto"
+    past: Telemetry | None = None
 
 
 @dataclass(frozen=True)
 class Forecasted:
-    """Future readings in the channels' own units: (n_times,) and per sensor (n_times,)."""
+    """Future readings in the channels' own units: (n_times,) and per sensor (n_times,).
+
+    ``whole`` is the low and the high end of the simultaneous band, in which a sensor's whole path stays with
+    ``whole_probability``; ``inputs`` says where the future of each driving channel comes from.
+    """
 
     time_us: NDArray[np.int64]
     mean: dict[str, NDArray[np.float64]]
     quantiles: dict[float, dict[str, NDArray[np.float64]]]
     notices: tuple[str, ...] = ()
+    whole: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
+    whole_probability: float = 0.9
+    inputs: Mapping[str, str] = field(default_factory=dict)
 
 
 class Workbench(Protocol):

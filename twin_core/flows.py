@@ -7,7 +7,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects import effect_to_json
 from twin_core.effects.heat import effect_heat_W
-from twin_core.forecast import future_record
+from twin_core.forecast.assumed import future_record
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
 from twin_core.network.model import Network, conductor_name
 from twin_core.network.terms import Along, Term

@@ -9,7 +9,7 @@ from replay.cli.command import FILE, Command
 
 if TYPE_CHECKING:
     from twin_core.calibrate import CalibratedModel
-    from twin_core.forecast import Forecast
+    from twin_core.forecast import Forecast, Inputs
     from twin_core.telemetry import Record
 
 _OUT = (".csv", ".json")
@@ -26,7 +26,14 @@ _OUT = (".csv", ".json")
 )
 @click.option("--horizon", required=True, type=float, help="Seconds to look ahead.")
 @click.option("--step", type=float, help="Seconds between forecasts.  [default: as the telemetry is sampled]")
-@click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP; inputs without a plan hold their last value.")
+@click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP.")
+@click.option(
+    "--inputs",
+    type=click.Choice(["auto", "repeat", "hold"]),
+    default="auto",
+    show_default=True,
+    help="Inputs without a plan: repeat the last period (auto: where there is one), or hold the last value.",
+)
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Forecast to write, .csv or .json.")
 @click.option("--json", "as_json", is_flag=True, help="Print the forecast as JSON.")
@@ -36,6 +43,7 @@ def forecast(
     horizon: float,
     step: float | None,
     plan: Path | None,
+    inputs: "Inputs",
     no_masking: bool,
     out: Path,
     as_json: bool,
@@ -55,7 +63,7 @@ def forecast(
     if step is None and record.time_s.size < 2:
         raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
     planned = _load_plan(plan, record, model, horizon) if plan else None
-    result = look_ahead(model, record, horizon, step_s=step, plan=planned)
+    result = look_ahead(model, record, horizon, step_s=step, plan=planned, inputs=inputs)
     document = _document(result, record, model)
     _write(out, document)
     notify([*record.notices, *(planned.notices if planned else ()), *result.notices])
@@ -110,6 +118,7 @@ def _check_plan(plan: "Record", inputs: list[str], now_s: float, horizon_s: floa
 
 def _document(result: "Forecast", record: "Record", model: "CalibratedModel") -> dict[str, Any]:
     """Return the forecast in the form that the service answers with, times in the telemetry's own form."""
+    from twin_core.forecast import WHOLE
     from twin_core.units import from_si
 
     units = {sensor: model.spec.channels[sensor].unit for sensor in result.sensors}
@@ -117,9 +126,23 @@ def _document(result: "Forecast", record: "Record", model: "CalibratedModel") ->
     for i, (sensor, unit) in enumerate(units.items()):
         bands = {f"q{100 * q:02.0f}": from_si(table[:, i], unit).tolist() for q, table in result.quantiles_K.items()}
         values[sensor] = {"mean": from_si(result.mean_K[:, i], unit).tolist()} | bands
+    bounds = {
+        sensor: {
+            end: from_si(table[:, i], unit).tolist() for end, table in zip(("low", "high"), result.whole_K, strict=True)
+        }
+        for i, (sensor, unit) in enumerate(units.items())
+    }
     time = [record.present(t) for t in result.time_s.tolist()]
     issued = record.present(float(record.time_s[-1]))
-    return {"issued": issued, "time": time, "values": values, "units": units, "notices": list(result.notices)}
+    return {
+        "issued": issued,
+        "time": time,
+        "values": values,
+        "whole": {"probability": WHOLE, "values": bounds},
+        "units": units,
+        "inputs": dict(result.inputs),
+        "notices": list(result.notices),
+    }
 
 
 def _write(out: Path, document: dict[str, Any]) -> None:

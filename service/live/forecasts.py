@@ -11,6 +11,8 @@ from service.live.tracker import Tracker
 from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Columns, ForecastRequest
+from service.store import samples
+from service.store.database import Database
 from service.store.models import Active
 from service.workbench import Forecasted, ForecastTask, Telemetry
 
@@ -18,6 +20,8 @@ SETTLE_S = 10.0
 """How long a forecast waits for samples that are stored but not yet assimilated."""
 MOST_POINTS = 20_000
 MOST_STEPS = 200_000
+PAST = 20_000
+"""Usual distances of samples, from which is told how inputs go on: two weeks of minutes."""
 
 Json = dict[str, Any]
 
@@ -40,7 +44,23 @@ def moment(twin: Entry, active: Active, position: Position) -> Telemetry:
     return Telemetry(active.epoch_us, np.array([position.time_us], dtype=np.int64), values)
 
 
-def build_task(twin: Entry, active: Active, position: Position, request: ForecastRequest) -> ForecastTask:
+async def past_of(twin: Entry, database: Database, active: Active, position: Position) -> Telemetry | None:
+    """Return what inputs and boundaries did up to the present; None where the twin has none."""
+    names = [name for name in twin.channels if name not in twin.sensors]
+    if not names:
+        return None
+    start_us = position.time_us - round(PAST * position.sampling_s * 1e6)
+    rows = [twin.channels.index(name) for name in names]
+    span_us = (start_us, position.time_us + 1)
+    found = await database.read(samples.select, twin.key, len(twin.channels), rows, *span_us)
+    if not found.time_us.size:
+        return None
+    return Telemetry(active.epoch_us, found.time_us, dict(zip(names, found.values, strict=True)))
+
+
+def build_task(
+    twin: Entry, active: Active, position: Position, past: Telemetry | None, request: ForecastRequest
+) -> ForecastTask:
     """Return what a worker needs for a forecast; BadField if the request asks for too much."""
     step_s = request.step_s or min(position.sampling_s, request.horizon_s)
     if step_s > request.horizon_s:
@@ -56,7 +76,8 @@ def build_task(twin: Entry, active: Active, position: Position, request: Forecas
     plan = None if request.plan is None else _plan(twin, request.plan, active.epoch_us)
     if plan is not None:
         _check_span(plan, position.time_us, position.time_us + round(request.horizon_s * 1e6))
-    return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, tuple(request.quantiles))
+    quantiles = tuple(request.quantiles)
+    return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, quantiles, request.inputs, past)
 
 
 def _plan(twin: Entry, plan: Columns, epoch_us: int) -> Telemetry | None:
@@ -122,6 +143,11 @@ def render(twin: Entry, active: Active, position: Position, made: Forecasted, qu
         "from": format_instant(position.time_us),
         "time": format_instants(made.time_us),
         "values": values,
+        "whole": {
+            "probability": made.whole_probability,
+            "values": {s: {"low": low.tolist(), "high": high.tolist()} for s, (low, high) in made.whole.items()},
+        },
         "units": {sensor: twin.units[sensor] for sensor in made.mean},
+        "inputs": dict(made.inputs),
         "notices": list(made.notices),
     }

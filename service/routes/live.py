@@ -13,7 +13,7 @@ from service.instants import format_instant, format_instants
 from service.live import forecasts, screening
 from service.registry import Entry
 from service.routes.telemetry import MOST_POINTS, span
-from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Network, Residuals
+from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Inputs, Network, Residuals
 from service.store import anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
 
@@ -31,22 +31,23 @@ SecondsOrNone = Annotated[float | None, Query(gt=0, allow_inf_nan=False)]
 
 @router.post("/forecasts", dependencies=[reads], response_model=Forecast)
 async def forecast(service: Running, twin: NamedTwin, request: ForecastRequest) -> Response:
-    """Look ahead from the assimilated state with planned inputs."""
+    """Look ahead from the assimilated state with planned inputs; the answer says what was assumed of the others."""
     return await _forecast(service, twin, request)
 
 
 @router.get("/forecast", dependencies=[reads], response_model=Forecast)
 async def forecast_as_is(
-    service: Running, twin: NamedTwin, horizon_s: Seconds, step_s: SecondsOrNone = None
+    service: Running, twin: NamedTwin, horizon_s: Seconds, step_s: SecondsOrNone = None, inputs: Inputs = "auto"
 ) -> Response:
-    """Look ahead from the assimilated state with the inputs as they are now."""
-    return await _forecast(service, twin, ForecastRequest(horizon_s=horizon_s, step_s=step_s))
+    """Look ahead from the assimilated state without a plan: inputs repeat or hold, as the answer says."""
+    return await _forecast(service, twin, ForecastRequest(horizon_s=horizon_s, step_s=step_s, inputs=inputs))
 
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
     tracker = service.live.tracker(twin)
     active, position = await forecasts.state_of(tracker)
-    task = forecasts.build_task(twin, active, position, request)
+    past = await forecasts.past_of(twin, service.database, active, position)
+    task = forecasts.build_task(twin, active, position, past, request)
     made = await service.live.engine.forecast(active.document, task)
     document = forecasts.render(twin, active, position, made, request.quantiles)
     document["notices"] += forecasts.notice(tracker)

@@ -166,8 +166,18 @@ function renderTemperatures(list, unit, from) {
   });
   $("plot-note").textContent = [
     archive.downsampled ? `extremes of ${count(archive.samples)} samples` : `${count(archive.samples)} samples`,
-    ahead ? "dashed: forecast with its 90 % band" : "",
+    ahead ? `dashed: forecast with its 90 % band${assumed(ahead.inputs)}` : "",
   ].filter(Boolean).join(" · ");
+}
+
+// What the forecast takes the inputs to do, in words: ", Q_sun repeats, Q_box holds".
+function assumed(inputs) {
+  const named = (how, word) => {
+    const names = Object.keys(inputs).filter((name) => inputs[name] === how);
+    return names.length ? `${names.length > 4 ? `${names.length} inputs` : names.join(", ")} ${word}` : "";
+  };
+  const parts = [named("repeat", "as in the last period"), named("hold", "held"), named("orbit", "from the orbit")].filter(Boolean);
+  return parts.length ? `; ${parts.join(", ")}` : "";
 }
 
 function renderResiduals(list) {

@@ -1,0 +1,132 @@
+"""What assumed inputs missed in the past, over the same horizon, pushed through the balance once more."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from twin_core._typing import FloatArray
+from twin_core.forecast.assumed import Rule
+from twin_core.network.model import Network
+from twin_core.network.spec import TwinSpec
+from twin_core.simulate.forcing import Forcing
+from twin_core.simulate.rollout import Rollout, rollout
+
+MOST_ORIGINS = 1024
+"""Moments of the past that are looked at; the most alike of them are used."""
+MEMBERS = 48
+"""The 5 and 95 % quantiles lie two or three members from the ends."""
+FEWEST_MEMBERS = 12
+MOST_MEMBER_STEPS = 400_000
+"""Time steps of all members together; long horizons get fewer members."""
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+@dataclass(frozen=True)
+class Missed:
+    """How far inputs went from what would have been assumed: channel -> (n_members, n_steps, 2), in SI.
+
+    ``known_s`` is the longest lead time of which the past tells anything.
+    """
+
+    errors: Mapping[str, FloatArray]
+    n_members: int
+    known_s: float
+
+
+def missed(rules: Mapping[str, Rule], now_s: float, forcing: Forcing) -> Missed | None:
+    """Return what the rules missed at moments of the past that were like the present; None where that is nothing.
+
+    A moment is as good as its channels' values are near those of now, in standard deviations, each channel counted by how
+    badly it is foretold: what a held heater did after it was off tells what it will do when it is off now. All channels
+    share their moments, so that what happens together stays together.
+
+    Parameters
+    ----------
+    rules
+        Of the channels without a plan.
+    now_s
+        The present, on the axis of their past.
+    forcing
+        Of the forecast.
+    """
+    varying = {name: rule for name, rule in rules.items() if rule.past.varies}
+    if not varying:
+        return None
+    first = max(float(r.past.time_s[0]) + (r.period_s or 0.0) for r in varying.values())
+    horizon_s = float(forcing.stage_time_s[-1, 1]) - now_s
+    # at most half of the past is what is told, so that moments remain from which it is told
+    known_s = min(horizon_s, 0.5 * (now_s - first))
+    if known_s <= 0.0:
+        return None
+    # quasi-random moments: no beat with any period, and any part of them is spread evenly
+    origins = first + (now_s - known_s - first) * ((0.5 + GOLDEN * np.arange(MOST_ORIGINS)) % 1.0)
+    most = int(np.clip(MOST_MEMBER_STEPS // max(forcing.n_steps, 1), FEWEST_MEMBERS, MEMBERS))
+    chosen = origins[_alike(varying, origins, now_s, known_s)[:most]]
+    lead = forcing.stage_time_s - now_s
+    errors = {name: _errors(rule, chosen, lead, known_s) for name, rule in varying.items()}
+    errors = {name: error for name, error in errors.items() if np.any(error)}
+    return Missed(errors, chosen.size, known_s) if errors else None
+
+
+def _alike(rules: Mapping[str, Rule], origins: FloatArray, now_s: float, known_s: float) -> np.ndarray:
+    """Return the origins in the order of how much they were like now."""
+    leads = known_s * (np.arange(16) + 0.5) / 16
+    distance = np.zeros(origins.size)
+    for rule in rules.values():
+        variance = float(rule.past.column.var())
+        error = rule.past.at(origins[:, None] + leads) - rule.ahead(origins[:, None], leads)
+        weight = float((error**2).mean()) / variance
+        there, here = rule.ahead(origins, np.zeros(1)), rule.ahead(now_s, np.zeros(1))
+        distance += min(weight, 2.0) * (there - here) ** 2 / variance
+    return np.argsort(np.round(distance, 3), kind="stable")
+
+
+def _errors(rule: Rule, origins: FloatArray, lead_s: FloatArray, known_s: float) -> FloatArray:
+    """Return what a channel did less what its rule says, (n_origins, n_steps, 2); a held channel holds over a step.
+
+    Beyond what the past tells, a repeated channel misses at each phase what it did before, a held one what it did last.
+    """
+    if rule.past.held:
+        lead_s = np.repeat(lead_s.mean(axis=1, keepdims=True), 2, axis=1)
+    if rule.period_s is not None and rule.period_s <= known_s:
+        whole = np.ceil(np.maximum(lead_s - known_s, 0.0) / rule.period_s)
+        lead_s = lead_s - whole * rule.period_s
+    lead_s = np.minimum(lead_s, known_s)
+    at = origins[:, None, None]
+    return rule.past.at(at + lead_s) - rule.ahead(at, lead_s)
+
+
+def deviations_K(
+    network: Network, values: FloatArray, forcing: Forcing, path: Rollout, rules: Mapping[str, Rule], found: Missed
+) -> FloatArray:
+    """Return how the observed states of each member differ from those of the forecast, (n_members, n_samples, n_sensors).
+
+    Each member is a rollout of its own, so that what saturates, switches or radiates does so. A member whose inputs have
+    no solution is left out.
+    """
+    spec = network.spec
+    column = {boundary.channel: i for i, boundary in enumerate(spec.boundaries.values()) if boundary.channel}
+    central = path.at_samples(forcing.sample_step)[:, network.sensor_node]
+    members = []
+    for k in range(found.n_members):
+        inputs, boundaries_K = dict(forcing.inputs), forcing.boundaries_K.copy()
+        for name, error in found.errors.items():
+            if name in inputs:
+                inputs[name] = _possible(spec, name, inputs[name] + error[k], rules[name])
+            if name in column:
+                boundaries_K[:, :, column[name]] += error[k]
+        other = replace(forcing, inputs=inputs, boundaries_K=boundaries_K)
+        moved = rollout(network, values, path.start_K, other, near=path.stages_K)
+        if moved.converged:
+            members.append(moved.at_samples(forcing.sample_step)[:, network.sensor_node] - central)
+    return np.array(members).reshape(len(members), *central.shape)
+
+
+def _possible(spec: TwinSpec, name: str, series: FloatArray, rule: Rule) -> FloatArray:
+    """Return an input that is one: within what it was ever seen at, on one of its levels."""
+    seen = rule.past.column
+    if spec.channels[name].levels:
+        levels = np.unique(seen)
+        return levels[np.abs(series[..., None] - levels).argmin(axis=-1)]
+    return np.clip(series, seen.min(), seen.max())
