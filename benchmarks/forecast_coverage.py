@@ -9,6 +9,7 @@ simultaneous band all of one orbit's (of one horizon's) with 90 %. ``python -m b
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -122,12 +123,7 @@ def main() -> None:
             model, record = spacecraft(seed, effect, arguments.starts)
             carried = ", ".join(e.name for e in model.effects) or "-"
             label = [f"orbits {seed}", effect, carried]
-
-            def orbits(
-                mode: str, model: CalibratedModel = model, record: Record = record
-            ) -> tuple[np.ndarray, np.ndarray]:
-                return coverage(model, record, cuts, HORIZON_ORBITS * ORBIT_S, 60.0, HORIZON_ORBITS, mode)
-
+            orbits = partial(coverage, model, record, cuts, HORIZON_ORBITS * ORBIT_S, 60.0, HORIZON_ORBITS)
             for row, inside, whole in rows_of(label, orbits):
                 rows.append(row)
                 totals[row[3]].append((inside, whole))
@@ -142,9 +138,8 @@ def main() -> None:
         model, record, starts, horizon_s = flight(name, arguments.sets)
         step_s = float(np.median(np.diff(record.time_s)))
         label = [name, "", f"horizon {horizon_s / 3600:.3g} h"]
-        rows += [
-            row for row, _, _ in rows_of(label, lambda m: coverage(model, record, starts, horizon_s, step_s, 1, m))
-        ]
+        count = partial(coverage, model, record, starts, horizon_s, step_s, 1)
+        rows += [row for row, _, _ in rows_of(label, count)]
     header = [
         "record",
         "hidden",

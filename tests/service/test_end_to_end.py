@@ -104,8 +104,29 @@ def test_forecast_with_a_plan_covers_what_came(server: Server) -> None:
         assert np.sqrt(np.mean((band["mean"] - read) ** 2)) < 5.0 * NOISE_K
         covered = np.mean((read >= band["q05"]) & (read <= band["q95"]))
         assert covered > 0.7
-    held = client.forecast("pair", horizon_s, step_s=STEP_S)
-    assert abs(held.values["T_a"]["mean"][-1] - made.values["T_a"]["mean"][-1]) > 0.5
+    assert made.inputs == {"Q": "plan"}
+
+
+@pytest.mark.parametrize(("inputs", "told"), [("auto", "repeat"), ("repeat", "repeat"), ("hold", "hold")])
+def test_forecast_without_a_plan_covers_what_came(server: Server, inputs: str, told: str) -> None:
+    """The power swings by 60 W with the orbit: held at its last value it alone would be off by many kelvin."""
+    client = server.client()
+    ahead = np.arange(N_TRAIN, N_TIMES)
+    made = client.forecast("pair", ahead.size * STEP_S, step_s=STEP_S, inputs=inputs)
+    parameters = {"horizon_s": ahead.size * STEP_S, "step_s": STEP_S, "inputs": inputs}
+    read = client._http.get("/v1/twins/pair/forecast", params=parameters).json()
+    assert made.values == read["values"]
+    assert made.inputs == read["inputs"] == {"Q": told}
+    assert [word for word in (made.notices or [""]) if "no plan was given: Q" in word]
+    assert made.whole is not None and made.whole.probability == 0.9
+    for name in ("T_a", "T_b"):
+        band = {key: np.array(column) for key, column in made.values[name].items()}
+        whole = made.whole.values[name]
+        covered = np.mean((TRUTH[name][ahead] >= band["q05"]) & (TRUTH[name][ahead] <= band["q95"]))
+        assert covered > 0.7
+        assert (np.array(whole["low"]) <= band["q05"]).all() and (np.array(whole["high"]) >= band["q95"]).all()
+        if told == "repeat":
+            assert np.sqrt(np.mean((band["mean"] - TRUTH[name][ahead]) ** 2)) < 8.0 * NOISE_K
 
 
 def test_network_balances(server: Server) -> None:

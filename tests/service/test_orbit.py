@@ -90,6 +90,8 @@ def test_a_forecast_needs_no_plan_of_the_sunlight(client: TwinClient) -> None:
     """Two orbits ahead: the swings through the eclipses are where they will be."""
     ahead = np.arange(N_TRAIN, N_TIMES)
     made = client.forecast("cube", ahead.size * STEP_S, step_s=STEP_S)
+    names = ("orbit.sun_mean", "orbit.albedo_mean", "orbit.earth_mean")
+    assert made.inputs == dict.fromkeys(names, "orbit") | {"Q": "hold"}
     mean = np.array(made.values["T"]["mean"])
     assert np.ptp(TRUTH[ahead]) > 10.0
     assert np.sqrt(np.mean((mean - TRUTH[ahead]) ** 2)) < 3.0 * NOISE_K

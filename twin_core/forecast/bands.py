@@ -1,7 +1,5 @@
 """Quantiles of a mixture of Gaussians, and the band in which a whole path stays."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.special import ndtr, ndtri
 

@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.forecast.assumed import Rule
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
@@ -19,6 +21,8 @@ MEMBERS = 48
 FEWEST_MEMBERS = 12
 MOST_MEMBER_STEPS = 400_000
 """Time steps of all members together; long horizons get fewer members."""
+FEWEST_STRETCHES = 3
+"""Two degrees of freedom: with one Student's interval is four times as wide, of a spread that nobody knows."""
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 
@@ -26,20 +30,23 @@ GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 class Missed:
     """How far inputs went from what would have been assumed: channel -> (n_members, n_steps, 2), in SI.
 
-    ``known_s`` is the longest lead time of which the past tells anything.
+    ``known_s`` is the longest lead time of which the past tells anything. Members scatter too little by ``widening``: they
+    come from no more independent stretches than horizons fit into the past.
     """
 
     errors: Mapping[str, FloatArray]
     n_members: int
     known_s: float
+    widening: float
 
 
 def missed(rules: Mapping[str, Rule], now_s: float, forcing: Forcing) -> Missed | None:
     """Return what the rules missed at moments of the past that were like the present; None where that is nothing.
 
-    A moment is as good as its channels' values are near those of now, in standard deviations, each channel counted by how
-    badly it is foretold: what a held heater did after it was off tells what it will do when it is off now. All channels
-    share their moments, so that what happens together stays together.
+    A moment is alike if the channel's value was near that of now: what a held heater did after it was off tells what it
+    will do when it is off now. Of the nearest quarter the moments are taken evenly over time. Channels of one period share
+    their moments, so that what happens together stays together; others are drawn each by itself, so that few episodes of
+    each make many of all.
 
     Parameters
     ----------
@@ -51,35 +58,55 @@ def missed(rules: Mapping[str, Rule], now_s: float, forcing: Forcing) -> Missed 
         Of the forecast.
     """
     varying = {name: rule for name, rule in rules.items() if rule.past.varies}
-    if not varying:
-        return None
-    first = max(float(r.past.time_s[0]) + (r.period_s or 0.0) for r in varying.values())
     horizon_s = float(forcing.stage_time_s[-1, 1]) - now_s
-    # at most half of the past is what is told, so that moments remain from which it is told
-    known_s = min(horizon_s, 0.5 * (now_s - first))
-    if known_s <= 0.0:
-        return None
-    # quasi-random moments: no beat with any period, and any part of them is spread evenly
-    origins = first + (now_s - known_s - first) * ((0.5 + GOLDEN * np.arange(MOST_ORIGINS)) % 1.0)
     most = int(np.clip(MOST_MEMBER_STEPS // max(forcing.n_steps, 1), FEWEST_MEMBERS, MEMBERS))
-    chosen = origins[_alike(varying, origins, now_s, known_s)[:most]]
     lead = forcing.stage_time_s - now_s
-    errors = {name: _errors(rule, chosen, lead, known_s) for name, rule in varying.items()}
+    errors: dict[str, FloatArray] = {}
+    known, stretches = [horizon_s], [np.inf]
+    rng = np.random.default_rng(0)
+    for group in _together(varying):
+        first = max(float(r.past.time_s[0]) + (r.period_s or 0.0) for r in group.values())
+        # at most half of the past is what is told, so that moments remain from which it is told
+        known_s = min(horizon_s, 0.5 * (now_s - first))
+        if known_s <= 0.0:
+            continue
+        # quasi-random moments: no beat with any period, and any part of them is spread evenly
+        origins = first + (now_s - known_s - first) * ((0.5 + GOLDEN * np.arange(MOST_ORIGINS)) % 1.0)
+        alike = _alike(group, origins, now_s)
+        chosen = rng.permutation(np.resize(origins[alike[:most]], most))
+        known.append(known_s)
+        stretches.append((now_s - first) / known_s)
+        errors |= {name: _errors(rule, chosen, lead, known_s) for name, rule in group.items()}
     errors = {name: error for name, error in errors.items() if np.any(error)}
-    return Missed(errors, chosen.size, known_s) if errors else None
+    return Missed(errors, most, min(known), widening(min(stretches))) if errors else None
 
 
-def _alike(rules: Mapping[str, Rule], origins: FloatArray, now_s: float, known_s: float) -> np.ndarray:
-    """Return the origins in the order of how much they were like now."""
-    leads = known_s * (np.arange(16) + 0.5) / 16
+def widening(n_independent: float) -> float:
+    """Return by what factor a 90 % interval has to be wider because mean and spread come from so few: Student's t."""
+    n = max(n_independent, FEWEST_STRETCHES)
+    return float(student.ppf(0.95, n - 1.0) * np.sqrt(1.0 + 1.0 / n) / norm.ppf(0.95))
+
+
+def _together(rules: Mapping[str, Rule]) -> list[dict[str, Rule]]:
+    """Return the channels in groups of one own period, to 1 %; those without one each alone."""
+    groups: list[tuple[float | None, dict[str, Rule]]] = []
+    for name, rule in rules.items():
+        own = None if rule.past.period is None else rule.past.period.period_s
+        same = [g for s, g in groups if s is not None and own is not None and abs(s - own) <= 0.01 * own]
+        if same:
+            same[0][name] = rule
+        else:
+            groups.append((own, {name: rule}))
+    return [group for _, group in groups]
+
+
+def _alike(rules: Mapping[str, Rule], origins: FloatArray, now_s: float) -> IntArray:
+    """Return the origins at which the channels were like now: the nearest quarter, ties included, in their own order."""
     distance = np.zeros(origins.size)
     for rule in rules.values():
-        variance = float(rule.past.column.var())
-        error = rule.past.at(origins[:, None] + leads) - rule.ahead(origins[:, None], leads)
-        weight = float((error**2).mean()) / variance
-        there, here = rule.ahead(origins, np.zeros(1)), rule.ahead(now_s, np.zeros(1))
-        distance += min(weight, 2.0) * (there - here) ** 2 / variance
-    return np.argsort(np.round(distance, 3), kind="stable")
+        there, here = rule.past.at(origins), rule.past.at(np.array([now_s]))
+        distance += (there - here) ** 2 / float(rule.past.column.var())
+    return np.flatnonzero(distance <= np.quantile(distance, 0.25))
 
 
 def _errors(rule: Rule, origins: FloatArray, lead_s: FloatArray, known_s: float) -> FloatArray:
@@ -120,7 +147,11 @@ def deviations_K(
         moved = rollout(network, values, path.start_K, other, near=path.stages_K)
         if moved.converged:
             members.append(moved.at_samples(forcing.sample_step)[:, network.sensor_node] - central)
-    return np.array(members).reshape(len(members), *central.shape)
+    moved = np.array(members).reshape(len(members), *central.shape)
+    if not members:
+        return moved
+    mean = moved.mean(axis=0)
+    return np.asarray(mean + found.widening * (moved - mean))
 
 
 def _possible(spec: TwinSpec, name: str, series: FloatArray, rule: Rule) -> FloatArray:

@@ -4,21 +4,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import t as student
+from scipy.stats import f as fisher
 
 from twin_core._typing import FloatArray
 
-SIGNIFICANCE = 0.01
-"""A period is told where cycles without one would resemble each other as closely in at most this share of records."""
+SIGNIFICANCE = 0.05
+"""A period is told where cycles without one would resemble each other as closely in at most this share of
+records. A period too many costs little: the bands contain what repeating missed."""
 LEAST_CYCLES = 3
-"""Two pairs of successive cycles: one alone has no scatter to test against."""
+"""Two pairs of successive cycles: one alone may be chance."""
 MOST_POINTS = 32_768
 """The grid on which a period is looked for; it is refined below the grid's spacing afterwards."""
 LEAST_POINTS = 4
 """Of a cycle: fewer show no shape."""
 SAME = 0.02
 """Autocorrelations this close to the best one are no worse: of a period and its multiples the shortest is meant. A square
-wave whose period lies half a grid spacing off loses 0.02 at 100 points a period."""
+wave whose period lies half a grid spacing off loses 0.02 at 100 points a period; chance adds 1 / sqrt(n_points)."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,11 @@ def find_period(time_s: FloatArray, column: FloatArray, *, held: bool) -> Period
     """Return the period of a channel; None where it has none that the samples show.
 
     The candidate is the shortest lag at which the autocorrelation peaks as high as anywhere. It is tested on whole
-    cycles, counted back from the last sample: were they not alike, the mean square of the difference of two successive
-    ones would be at least the sum of the variances within them (as much for white noise, three times as much for a random
-    walk). The logarithms of these ratios are compared with zero by Student's t, one-sided; as neighbouring pairs share a
-    cycle, their mean is given twice the variance of independent ones, the most that such sharing can cause.
+    cycles, counted back from the last sample: were they not alike, half the mean square of the difference of two
+    successive ones would be at least the variance within them (equal to it for white noise, three times it for a random
+    walk). Their ratio is compared with Fisher's F. A cycle counts for as many independent samples as Bartlett's formula
+    makes of its autocorrelation; differences that share a cycle count for 1 / 1.5 each; and as the best of many lags is
+    tested, the p-value is multiplied by the number of independent ones among them.
 
     Parameters
     ----------
@@ -51,21 +53,24 @@ def find_period(time_s: FloatArray, column: FloatArray, *, held: bool) -> Period
     spacing_s = max(float(np.median(np.diff(time_s))), span_s / (MOST_POINTS - 1))
     grid_s = time_s[-1] - spacing_s * np.arange(int(span_s / spacing_s + 1e-9) + 1)[::-1]
     series = values_at(time_s, column, grid_s, held=held)
-    lag = _peak(series)
-    if lag is None:
+    found = _peak(series)
+    if found is None:
         return None
-    n_cycles = int(series.size / lag)
+    lag, r = found
+    n_cycles = int(series.size / lag + 0.1)  # one that lacks a tenth is cut to the rest, like all others
     if n_cycles < LEAST_CYCLES:
         return None
-    edges = series.size - np.rint(lag * np.arange(n_cycles, -1, -1)).astype(int)
+    edges = np.maximum(series.size - np.rint(lag * np.arange(n_cycles, -1, -1)).astype(int), 0)
     length = int(np.diff(edges).min())
     cycles = np.stack([series[stop - length : stop] for stop in edges[1:]])
-    change = ((cycles[1:] - cycles[:-1]) ** 2).mean(axis=1)
-    within = cycles.var(axis=1)
-    size = np.finfo(np.float64).eps * max(float(series.var()), np.finfo(np.float64).tiny)
-    ratios = np.log((change + size) / (within[1:] + within[:-1] + size))
-    p_value = _p_value(ratios)
-    return Period(lag * spacing_s, p_value) if p_value <= SIGNIFICANCE else None
+    change, within = 0.5 * ((cycles[1:] - cycles[:-1]) ** 2).mean(), cycles.var(axis=1).mean()
+    if within <= 0.0:
+        return None
+    independent = lag / (1.0 + 2.0 * (r[1 : int(0.5 * lag) + 1] ** 2).sum())
+    freedom = independent * (n_cycles - 1) / 1.5, independent * n_cycles
+    n_lags = max(1.0, independent * n_cycles / LEAST_CYCLES)
+    p_value = float(min(1.0, n_lags * fisher.cdf(change / within, *freedom)))
+    return Period(float(lag) * spacing_s, p_value) if p_value <= SIGNIFICANCE else None
 
 
 def values_at(time_s: FloatArray, column: FloatArray, wanted_s: FloatArray, *, held: bool) -> FloatArray:
@@ -75,8 +80,8 @@ def values_at(time_s: FloatArray, column: FloatArray, wanted_s: FloatArray, *, h
     return column[np.maximum(np.searchsorted(time_s, wanted_s + 1e-6, side="right") - 1, 0)]
 
 
-def _peak(series: FloatArray) -> float | None:
-    """Return the lag, in grid spacings, of the shortest of the highest peaks; None where there is none."""
+def _peak(series: FloatArray) -> tuple[float, FloatArray] | None:
+    """Return the lag, in grid spacings, of the shortest of the highest peaks, and the autocorrelation; None without any."""
     n = series.size
     centred = series - np.polynomial.Polynomial.fit(np.arange(n), series, 1)(np.arange(n))
     size = next_fast_len(2 * n)
@@ -92,27 +97,19 @@ def _peak(series: FloatArray) -> float | None:
     peaks = peaks[(peaks > below[0]) & (peaks >= LEAST_POINTS)]
     if not peaks.size or r[peaks].max() <= 0.0:
         return None
-    enough = r[peaks] >= 1.0 - 1.25 * (1.0 - r[peaks].max()) - SAME
+    enough = r[peaks] >= 1.0 - 1.25 * (1.0 - r[peaks].max()) - SAME - 1.0 / np.sqrt(n)
     first = lag = float(peaks[np.argmax(enough)])
     for multiple in range(1, int(0.5 * n / first) + 1):  # a peak at k periods tells the period k times as finely
-        near = min(round(multiple * lag), n - 4)
-        top = near - 2 + int(np.argmax(r[near - 2 : near + 3]))
-        lag = (top + _vertex(r[top - 1 : top + 2])) / multiple
+        near = round(multiple * lag) + np.arange(-3, 4)
+        alike = np.array([-((series[k:] - series[:-k]) ** 2).mean() for k in near])  # ends do not bend it as they do r
+        top = 1 + int(np.argmax(alike[1:-1]))
+        lag = (near[top] + _vertex(alike[top - 1 : top + 2])) / multiple
         if abs(lag - first) > 0.1 * first:  # the peaks are no multiples of one lag
             return None
-    return lag
+    return lag, r
 
 
 def _vertex(three: FloatArray) -> float:
     """Return where a parabola through three neighbours peaks, relative to the middle one."""
     curve = three[0] - 2.0 * three[1] + three[2]
     return 0.0 if curve >= 0.0 else float(np.clip(0.5 * (three[0] - three[2]) / curve, -0.5, 0.5))
-
-
-def _p_value(ratios: FloatArray) -> float:
-    """Return the one-sided p-value of the mean of logarithms of ratios being below zero."""
-    std = float(ratios.std(ddof=1))
-    mean = float(ratios.mean())
-    if std <= 0.0:
-        return 0.0 if mean < 0.0 else 1.0
-    return float(student.cdf(mean / (std * np.sqrt(2.0 / ratios.size)), ratios.size - 1))
