@@ -147,11 +147,11 @@ def deviations_K(
         moved = rollout(network, values, path.start_K, other, near=path.stages_K)
         if moved.converged:
             members.append(moved.at_samples(forcing.sample_step)[:, network.sensor_node] - central)
-    moved = np.array(members).reshape(len(members), *central.shape)
+    deviations = np.array(members).reshape(len(members), *central.shape)
     if not members:
-        return moved
-    mean = moved.mean(axis=0)
-    return np.asarray(mean + found.widening * (moved - mean))
+        return deviations
+    mean = deviations.mean(axis=0)
+    return np.asarray(mean + found.widening * (deviations - mean))
 
 
 def _possible(spec: TwinSpec, name: str, series: FloatArray, rule: Rule) -> FloatArray:
