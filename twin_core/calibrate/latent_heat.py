@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.gp.kalman import kalman_filter
 from twin_core.gp.smoother import smooth
-from twin_core.latent_force.held import HeldForce
+from twin_core.latent_force.held import Grid, HeldForce, grid_of
 from twin_core.latent_force.whitening import affine_march
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
@@ -57,7 +57,8 @@ class Nominal:
     steps: Steps
     reference_K: FloatArray
     offset_K: FloatArray
-    sample_of: np.ndarray
+    sample_of: IntArray
+    grid: Grid
 
     @property
     def residual_K(self) -> FloatArray:
@@ -129,7 +130,8 @@ def linearise(
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
     offset_K = reading_offsets_K(network, values, segment.record.clock_s)
     read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
-    return Nominal(segment, states_K[:-1], extra_W, steps, read, offset_K, sample_of)
+    grid = grid_of(forcing.step_s, sample_of, segment.valid)
+    return Nominal(segment, states_K[:-1], extra_W, steps, read, offset_K, sample_of, grid)
 
 
 def floor_K2(problem: Problem) -> FloatArray:
@@ -153,7 +155,8 @@ def held_force(problem: Problem, latent: LatentHeat, nominal: Nominal) -> HeldFo
 
 def whiten(problem: Problem, latent: LatentHeat, nominal: Nominal, columns: FloatArray) -> tuple[FloatArray, float]:
     """Return columns (n_samples, n_sensors, n_columns) in the metric of the readings, and ln det of their covariance."""
-    return held_force(problem, latent, nominal).whiten(columns, nominal.sample_of, nominal.segment.valid)
+    force = held_force(problem, latent, nominal)
+    return force.whiten(columns, nominal.sample_of, nominal.segment.valid, nominal.grid)
 
 
 def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> float:

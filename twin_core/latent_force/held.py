@@ -18,6 +18,65 @@ from twin_core.latent_force.whitening import whiten_columns
 from twin_core.simulate.one_step import Steps
 
 COLUMNS_AT_ONCE = 192
+SAME_LENGTH = 1e-6
+"""Steps whose lengths differ by less than this share are of one kind."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """How the steps of a record repeat.
+
+    Attributes
+    ----------
+    step_s : (n_kinds,)
+        Lengths that differ.
+    kind : (n_steps,)
+        Which of them each step has.
+    interval : (n_steps,)
+        As in :func:`intervals`.
+    """
+
+    step_s: FloatArray
+    kind: IntArray
+    interval: IntArray
+
+    def means(self, matrices: FloatArray) -> FloatArray:
+        """Return the mean over all steps of a kind, (n_kinds, n, n), of (n_steps, n, n)."""
+        if self.step_s.size == 1:
+            return matrices.mean(axis=0, keepdims=True)
+        counts = np.bincount(self.kind)
+        begins = np.cumsum(counts) - counts
+        gathered = np.add.reduceat(matrices[np.argsort(self.kind, kind="stable")], begins, axis=0)
+        return np.asarray(gathered / counts[:, None, None])
+
+
+def grid_of(step_s: FloatArray, sample_of: IntArray, valid: BoolArray) -> Grid:
+    """Return how steps repeat: (n_steps,) lengths, (n_steps + 1,) samples on them, (n_samples, n_sensors) readings."""
+    rounded = np.round(np.log(step_s) / SAME_LENGTH)
+    _, first, kind = np.unique(rounded, return_index=True, return_inverse=True)
+    kind = kind.ravel().astype(np.int64)
+    return Grid(step_s[first], kind, intervals(kind, sample_of, valid))
+
+
+def intervals(kind: IntArray, sample_of: IntArray, valid: BoolArray) -> IntArray:
+    """Return for each step which kind of interval between samples it belongs to, (n_steps,); -1 where it is like no other.
+
+    Alike are intervals of equally many steps of one kind that end with readings of the same sensors.
+    """
+    ends = np.flatnonzero(sample_of[1:] >= 0)  # steps that end in a sample
+    if ends.size == 0:
+        return np.full(kind.size, -1, dtype=np.int64)
+    begins = np.concatenate([[0], ends[:-1] + 1])
+    least, greatest = np.minimum.reduceat(kind, begins), np.maximum.reduceat(kind, begins)
+    greatest[-1] = kind[begins[-1] : ends[-1] + 1].max()
+    least[-1] = kind[begins[-1] : ends[-1] + 1].min()
+    _, pattern = np.unique(valid[sample_of[ends + 1]], axis=0, return_inverse=True)
+    table = np.stack([kind[ends], ends - begins, pattern.ravel()], axis=1)
+    _, alike = np.unique(table, axis=0, return_inverse=True)
+    alike = np.where(least == greatest, alike.ravel(), -1)
+    found = np.full(kind.size, -1, dtype=np.int64)
+    found[: ends[-1] + 1] = np.repeat(alike, ends - begins + 1)
+    return found
 
 
 @dataclass(frozen=True)
@@ -56,8 +115,13 @@ class HeldForce:
         """Share of the heat that is left after each step, (n_steps,)."""
         return np.exp(-self.step_s / self.length_s)
 
-    def whiten(self, columns: FloatArray, sample_of: IntArray, valid: BoolArray) -> tuple[FloatArray, float]:
+    def whiten(
+        self, columns: FloatArray, sample_of: IntArray, valid: BoolArray, grid: Grid | None = None
+    ) -> tuple[FloatArray, float]:
         """Return columns of readings in the metric of the model, and ln det of the readings' covariance.
+
+        Undeclared heat reaches the sensors through the mean of A and B over all steps of the same length: how it spreads is a
+        matter of its prior, and a filter whose steps are alike settles, so that a long record costs little.
 
         Parameters
         ----------
@@ -66,19 +130,25 @@ class HeldForce:
         sample_of : (n_steps + 1,)
             Sample at each point of the grid, -1 where there is none.
         valid : (n_samples, n_sensors)
+        grid
+            How the steps repeat, where it is known already.
         """
+        grid = grid or grid_of(self.step_s, sample_of, valid)
+        transition, response = grid.means(self.steps.transition), grid.means(self.steps.heat_response_K_per_W)
         parts, log_det = [], 0.0
         for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
             whitened, log_det = whiten_columns(
-                self.steps.transition,
-                self.steps.heat_response_K_per_W,
-                self.decay,
+                transition,
+                response,
+                np.exp(-grid.step_s / self.length_s),
+                grid.kind,
                 self.std_W**2,
                 self.floor_K2,
                 self.sensor_node,
                 self.noise_K**2,
                 self.start_std_K**2,
                 sample_of,
+                grid.interval,
                 valid,
                 np.ascontiguousarray(np.nan_to_num(columns[:, :, first : first + COLUMNS_AT_ONCE])),
             )

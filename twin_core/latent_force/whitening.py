@@ -10,6 +10,9 @@ from numba import njit
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 
+SETTLED = 1e-8
+"""A covariance that moves by less from sample to sample, in units of its deviations, has reached its limit."""
+
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_covariance(
@@ -62,26 +65,43 @@ def _predict_columns(full: FloatArray, mean: FloatArray, work: FloatArray, keep:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
-def _condition(
-    o: int, noise: float, cov: FloatArray, mean: FloatArray, reading: FloatArray, out: FloatArray, gain: FloatArray
-) -> float:
-    """Condition every column on one sensor; write whitened innovations; return their common variance."""
-    both, n_columns = mean.shape
+def _condition(o: int, noise: float, cov: FloatArray, gain: FloatArray) -> float:
+    """Condition the covariance on one sensor; write the gain; return the variance of the innovation."""
+    both = cov.shape[0]
     variance = cov[o, o] + noise
-    root = np.sqrt(variance)
     for i in range(both):
         gain[i] = cov[i, o] / variance
+    for i in range(both):
+        for j in range(i + 1):
+            cov[i, j] -= gain[i] * gain[j] * variance
+            cov[j, i] = cov[i, j]
+    return variance
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def _correct_columns(
+    o: int, variance: float, gain: FloatArray, mean: FloatArray, reading: FloatArray, out: FloatArray
+) -> None:
+    """Correct the mean of every column by one reading; write whitened innovations."""
+    both, n_columns = mean.shape
+    root = np.sqrt(variance)
     for c in range(n_columns):
         out[c] = reading[c] - mean[o, c]
     for i in range(both):
         for c in range(n_columns):
             mean[i, c] += gain[i] * out[c]
-        for j in range(i + 1):
-            cov[i, j] -= gain[i] * gain[j] * variance
-            cov[j, i] = cov[i, j]
     for c in range(n_columns):
         out[c] /= root
-    return variance
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _settled(cov: FloatArray, before: FloatArray) -> bool:
+    """Return whether a covariance has stopped moving: by less than ``SETTLED`` in units of its deviations."""
+    for i in range(cov.shape[0]):
+        for j in range(i + 1):
+            if (cov[i, j] - before[i, j]) ** 2 > SETTLED**2 * cov[i, i] * cov[j, j]:
+                return False
+    return True
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
@@ -89,23 +109,30 @@ def whiten_columns(
     transition: FloatArray,
     response: FloatArray,
     keep: FloatArray,
+    kind: IntArray,
     force_variance: FloatArray,
     state_variance: FloatArray,
     observed: IntArray,
     noise_variance: FloatArray,
     start_variance: FloatArray,
     sample_of: IntArray,
+    interval: IntArray,
     valid: BoolArray,
     columns: FloatArray,
 ) -> tuple[FloatArray, float]:
     """Pass columns of readings through the filter.
 
+    Where the same kind of interval follows itself, the covariance soon stops moving (the algebraic Riccati equation; Anderson
+    and Moore, Optimal Filtering, 1979, section 4.4): from there on only the columns are advanced, with the gains at hand.
+
     Parameters
     ----------
-    transition, response : (n_steps, n, n)
-        d end / d start, and d end / d heat held over the step.
-    keep : (n_steps,)
+    transition, response : (n_kinds, n, n)
+        d end / d start, and d end / d heat held over a step of each kind.
+    keep : (n_kinds,)
         exp(-h / length) of the heat.
+    kind : (n_steps,)
+        Which kind of step each one is.
     force_variance : (n,)
         Stationary variance of the heat on each node, W^2.
     state_variance : (n,)
@@ -117,6 +144,9 @@ def whiten_columns(
         Prior variance of the initial temperatures.
     sample_of : (n_steps + 1,)
         Row of ``columns`` at each point of the grid, -1 where there is no sample.
+    interval : (n_steps,)
+        For each step which kind of interval, from sample to sample, it belongs to: the same steps, and the same sensors
+        read at its end. Negative where it is like no other.
     valid : (n_samples, n_sensors)
     columns : (n_samples, n_sensors, n_columns)
 
@@ -125,27 +155,41 @@ def whiten_columns(
     (n_samples, n_sensors, n_columns), float
         Innovations over their standard deviation, zero where invalid; ln det of the covariance of the readings.
     """
-    n_steps, n = transition.shape[0], transition.shape[1]
+    n_steps, n = kind.size, transition.shape[1]
     out = np.zeros_like(columns)
     cov, full, turned = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
-    mean, work, gain = np.zeros((2 * n, columns.shape[2])), np.empty((n, columns.shape[2])), np.empty(2 * n)
+    before = np.zeros((2 * n, 2 * n))
+    mean, work = np.zeros((2 * n, columns.shape[2])), np.empty((n, columns.shape[2]))
+    gains, variances = np.zeros((observed.size, 2 * n)), np.ones(observed.size)
     for i in range(n):
         cov[i, i] = start_variance[i]
         cov[n + i, n + i] = force_variance[i]
-    log_det = 0.0
+    log_det, last, settled = 0.0, -1, -1
     for k in range(n_steps + 1):
+        here = interval[k - 1] if k > 0 else -1
+        frozen = here >= 0 and here == settled
         if k > 0:
-            full[:n, :n] = transition[k - 1]
-            full[:n, n:] = response[k - 1]
-            _predict_covariance(full, cov, turned, keep[k - 1], force_variance, state_variance)
-            _predict_columns(full, mean, work, keep[k - 1])
+            c = kind[k - 1]
+            full[:n, :n] = transition[c]
+            full[:n, n:] = response[c]
+            if not frozen:
+                settled = -1
+                _predict_covariance(full, cov, turned, keep[c], force_variance, state_variance)
+            _predict_columns(full, mean, work, keep[c])
         row = sample_of[k]
         if row < 0:
             continue
         for s in range(observed.size):
             if valid[row, s]:
-                reading, whitened = columns[row, s], out[row, s]
-                log_det += np.log(_condition(observed[s], noise_variance[s], cov, mean, reading, whitened, gain))
+                if not frozen:
+                    variances[s] = _condition(observed[s], noise_variance[s], cov, gains[s])
+                log_det += np.log(variances[s])
+                _correct_columns(observed[s], variances[s], gains[s], mean, columns[row, s], out[row, s])
+        if not frozen:
+            if here >= 0 and here == last and _settled(cov, before):
+                settled = here
+            before[:] = cov
+            last = here
     return out, log_det
 
 

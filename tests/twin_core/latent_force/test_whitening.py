@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from twin_core.latent_force.held import intervals
 from twin_core.latent_force.whitening import affine_march, whiten_columns
 
 N, N_STEPS, N_COLUMNS = 3, 14, 4
@@ -18,6 +19,8 @@ def system(seed: int) -> dict[str, np.ndarray]:
         "transition": 0.9 * np.eye(N) + 0.05 * rng.normal(size=(N_STEPS, N, N)),
         "response": 0.3 * np.eye(N) + 0.05 * rng.normal(size=(N_STEPS, N, N)),
         "keep": rng.uniform(0.2, 0.95, N_STEPS),
+        "kind": np.arange(N_STEPS),
+        "interval": np.full(N_STEPS, -1),
         "force_variance": rng.uniform(0.1, 4.0, N),
         "state_variance": rng.uniform(1e-4, 1e-2, N),
         "observed": np.array([2, 0], dtype=np.int64),
@@ -95,6 +98,8 @@ def test_without_undeclared_heat_only_the_start_and_noise_are_left() -> None:
         "transition": np.tile(np.eye(1), (n_times - 1, 1, 1)),
         "response": np.zeros((n_times - 1, 1, 1)),
         "keep": np.full(n_times - 1, 0.5),
+        "kind": np.arange(n_times - 1),
+        "interval": np.full(n_times - 1, -1),
         "force_variance": np.zeros(1),
         "state_variance": np.zeros(1),
         "observed": np.zeros(1, dtype=np.int64),
@@ -117,3 +122,47 @@ def test_affine_march_is_the_recursion() -> None:
     for k in range(5):
         expected.append(transition[k] @ expected[-1] + offset[k])
     np.testing.assert_allclose(found, np.array(expected), rtol=1e-12, atol=1e-12)
+
+
+def alike(n_steps: int, seed: int = 0) -> dict[str, np.ndarray]:
+    """Return a system whose steps are alike, sampled at every other step, with one stretch in which a sensor is silent."""
+    rng = np.random.default_rng(seed)
+    n_rows = n_steps // 2 + 1
+    sample_of = np.full(n_steps + 1, -1, dtype=np.int64)
+    sample_of[::2] = np.arange(n_rows)
+    valid = np.ones((n_rows, 2), dtype=np.bool_)
+    valid[n_rows // 3 : n_rows // 2, 1] = False
+    kind = np.zeros(n_steps, dtype=np.int64)
+    return {
+        **system(seed),
+        "transition": 0.9 * np.eye(N)[None] + 0.03 * rng.normal(size=(1, N, N)),
+        "response": 0.3 * np.eye(N)[None],
+        "keep": np.array([0.8]),
+        "kind": kind,
+        "sample_of": sample_of,
+        "interval": intervals(kind, sample_of, valid),
+        "valid": valid,
+        "columns": rng.normal(size=(n_rows, 2, N_COLUMNS)),
+    }
+
+
+def test_a_filter_that_has_settled_is_the_filter_that_never_does() -> None:
+    s = alike(2400)
+    never = whiten_columns(**{**s, "interval": np.full(s["kind"].size, -1)})
+    found = whiten_columns(**s)
+    np.testing.assert_allclose(found[0], never[0], rtol=1e-5, atol=1e-6)
+    assert found[1] == pytest.approx(never[1], rel=1e-7)
+
+
+def test_intervals_are_alike_where_steps_and_sensors_are() -> None:
+    kind = np.array([0, 0, 1, 1, 0, 1, 0, 0, 0])
+    sample_of = np.array([0, -1, 1, -1, 2, -1, 3, -1, 4, -1])
+    valid = np.array([[True], [True], [True], [True], [True]])
+    found = intervals(kind, sample_of, valid)
+    assert found[0] == found[1] == found[6] == found[7] >= 0  # two steps of kind 0
+    assert found[2] == found[3] >= 0 and found[2] != found[0]
+    assert found[4] == found[5] == -1  # one of each kind
+    assert found[8] == -1  # no sample follows
+    valid[4] = False
+    found = intervals(kind, sample_of, valid)
+    assert found[6] != found[0]
