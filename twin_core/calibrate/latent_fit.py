@@ -109,6 +109,7 @@ def fit_with_latent_heat(
     near: HeatFit | None = None,
     n_passes: int = 12,
     leashes: Sequence[float] = LEASHES,
+    resized: Sequence[int] | None = None,
 ) -> HeatFit:
     """Fit the free parameters in the presence of latent heat.
 
@@ -124,6 +125,9 @@ def fit_with_latent_heat(
         Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
     leashes
         Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
+    resized
+        Nodes on which the latent heat is sized anew, beside one factor for all; by default all, and its length. With
+        ``near`` only.
 
     Returns
     -------
@@ -135,7 +139,7 @@ def fit_with_latent_heat(
     if near is not None:
         nominals, latent = _carried_over(problem, values, near)
         sizes = new_search(problem.n_nodes, 1.5)
-        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes)
+        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes, resized)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
@@ -152,23 +156,26 @@ def fit_with_latent_heat(
     return _settle(fit, sizes, n_passes)
 
 
-def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int) -> HeatFit:
+def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int, resized: Sequence[int] | None = None) -> HeatFit:
     """Take passes until the likelihood no longer grows."""
     for _ in range(n_passes):
         before = fit.log_likelihood
-        fit = _pass(fit, sizes, np.inf)
-        if fit.log_likelihood - before < SETTLED_NATS and (sizes.log_step < SETTLED_LOG_STEP).all():
+        fit = _pass(fit, sizes, np.inf, resized=resized)
+        small = (sizes.log_step[list(sizes.positions(resized))] < SETTLED_LOG_STEP).all()
+        if fit.log_likelihood - before < SETTLED_NATS and small:
             break
     return fit
 
 
-def _pass(fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = False) -> HeatFit:
+def _pass(
+    fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = False, resized: Sequence[int] | None = None
+) -> HeatFit:
     """Relinearise about smoothed temperatures where asked, then improve parameters, then the latent heat's size."""
     problem, nominals = fit.problem, fit.nominals
     if smoothing:
         nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
     free, latent, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
-    latent, value = sizes.improve(problem, latent, nominals)
+    latent, value = sizes.improve(problem, latent, nominals, resized)
     return HeatFit(problem, free, latent, nominals, value)
 
 

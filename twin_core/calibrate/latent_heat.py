@@ -101,10 +101,15 @@ class HeatFit:
         return self.problem.network.parameters.to_values(self.free)
 
     @property
+    def log_prior(self) -> float:
+        """What the priors of the parameters hold against it, in nats: at most 0."""
+        parameters = self.problem.network.parameters
+        return -0.5 * float((((self.free - parameters.free) / parameters.prior_std) ** 2).sum())
+
+    @property
     def log_posterior(self) -> float:
         """Log-likelihood of the readings less what the priors of the parameters hold against them."""
-        parameters = self.problem.network.parameters
-        return self.log_likelihood - 0.5 * float((((self.free - parameters.free) / parameters.prior_std) ** 2).sum())
+        return self.log_likelihood + self.log_prior
 
     def unknowns(self) -> FloatArray:
         """Return the unknown vector of the trajectory problem here: parameters and smoothed initial temperatures."""
@@ -170,12 +175,6 @@ def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nomi
         with np.errstate(over="ignore", invalid="ignore"):  # a linearisation that ran away is as unlikely as can be
             total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
     return total if np.isfinite(total) else -np.inf
-
-
-def gain_of_latent_heat(fit: HeatFit) -> float:
-    """Return the log-likelihood that undeclared heat adds to a fit, in nats: next to nothing where nothing is missing."""
-    none = LatentHeat(np.full_like(fit.latent.std_W, NO_HEAT_W), fit.latent.length_s)
-    return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
 
 
 def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:

@@ -15,6 +15,9 @@ LENGTH_SHARES = (0.004, 0.02, 0.08)
 LONGEST_SHARE = 0.1
 """The correlation length is at most this share of the record, so that lasting heat stays improbable."""
 
+ALL_NODES = -1
+"""Stands for the sizes on all nodes, moved by one factor."""
+
 SMALLEST_LOG_STEP, LARGEST_LOG_STEP = 0.1, 2.5
 
 
@@ -24,16 +27,25 @@ class SizeSearch:
 
     Attributes
     ----------
-    log_step : (n_nodes + 1,)
-        Next change to be tried, in ln: of the size on each node, and of the correlation length.
+    log_step : (n_nodes + 2,)
+        Next change to be tried, in ln: of the size on each node, of the correlation length, and of all sizes together.
     """
 
     log_step: FloatArray
 
-    def improve(self, problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
-        """Return a more likely size of the latent heat on each node, and its log-likelihood."""
+    def positions(self, nodes: Sequence[int] | None) -> tuple[int, ...]:
+        """Return what is tried: every node's size and the length, or with ``nodes`` the size of all and of these."""
+        return tuple(range(self.log_step.size - 1)) if nodes is None else (ALL_NODES, *nodes)
+
+    def improve(
+        self, problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal], nodes: Sequence[int] | None = None
+    ) -> tuple[LatentHeat, float]:
+        """Return a more likely size of the latent heat, and its log-likelihood.
+
+        Sizes and correlation length are tried in turn; with ``nodes`` only the sizes on these, and of all together.
+        """
         best, value = latent, log_likelihood(problem, latent, nominals)
-        for position in range(problem.n_nodes + 1):
+        for position in self.positions(nodes):
             moved = False
             for sign in (-1.0, 1.0):
                 trial = self._changed(best, position, sign, nominals)
@@ -52,7 +64,7 @@ class SizeSearch:
             length = np.clip(latent.length_s * factor, shortest, LONGEST_SHARE * span_s(nominals))
             return replace(latent, length_s=float(length))
         std = latent.std_W.copy()
-        std[position] *= factor
+        std[slice(None) if position == ALL_NODES else position] *= factor
         return replace(latent, std_W=std)
 
 
@@ -63,7 +75,7 @@ def span_s(nominals: Sequence[Nominal]) -> float:
 
 def new_search(n_nodes: int, log_step: float) -> SizeSearch:
     """Return a search whose first steps are ``log_step``; that of the length is gentler."""
-    return SizeSearch(np.append(np.full(n_nodes, log_step), 0.7))
+    return SizeSearch(np.append(np.full(n_nodes, log_step), [0.7, log_step]))
 
 
 def first_size(problem: Problem, nominals: Sequence[Nominal]) -> LatentHeat:

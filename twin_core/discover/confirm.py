@@ -13,11 +13,12 @@ from twin_core.calibrate.covariance import gls_covariance
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.latent_size import first_size
+from twin_core.calibrate.lumping import log_likelihood_beside_lumping
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration, from_heat_fit
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
 
 N_BLOCKS = 8
@@ -97,6 +98,11 @@ class Trial:
         """Misfit over noise, rms over sensors: how much the open-loop model leaves beyond the sensors' own noise."""
         models, noise = self.calibration.whitener.models, self.calibration.problem.noise_K
         return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
+
+    @cached_property
+    def log_evidence(self) -> float:
+        """Log-likelihood with what a lumped network cannot follow integrated out, less what the priors hold against it."""
+        return log_likelihood_beside_lumping(self.fit) + self.fit.log_prior
 
     @property
     def n_samples(self) -> int:
@@ -204,7 +210,7 @@ def _opening(segment: Segment) -> BoolArray:
     return np.arange(n_rows)[:, None] < max(int(OPENING_SHARE * n_rows), 3)
 
 
-def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) -> Trial:
+def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, quick: bool = False) -> Trial:
     """Return the trial of a set of effects, fitted with all parameters from a trial close by.
 
     Parameters
@@ -215,6 +221,8 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
         All effects of the new trial, at their starting values.
     n_passes
         Passes of the fit at most: few to rank, many to settle.
+    quick
+        Whether the latent heat is sized anew only where the effects act.
     """
     problem = extended(base.fit.problem, effects)
     names = base.fit.problem.network.parameters.free_names
@@ -226,7 +234,9 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
             for name, value in zip(problem.network.parameters.free_names, problem.network.parameters.free, strict=True)
         ]
     )
-    fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=n_passes)
+    layout = problem.network.layout
+    touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
+    fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=n_passes, resized=touched if quick else None)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 
@@ -336,7 +346,7 @@ class Validation:
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return what the likelihood in the presence of latent heat says for the rich trial, chosen among ``n_tried``."""
-    return _evidence(rich.fit.log_posterior - simple.fit.log_posterior, simple, rich, n_tried)
+    return _evidence(rich.log_evidence - simple.log_evidence, simple, rich, n_tried)
 
 
 def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:

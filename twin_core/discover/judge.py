@@ -6,42 +6,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
-from twin_core.discover.form import leaves_a_repeatable_heat, leaves_declaration, outdone_by_a_free_form
+from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.effects.base import Effect
 
 N_VALIDATED, N_VALIDATED_FREE = 3, 8
 """Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
 
 ALTERNATIVE_NATS = 3.0
-VALIDATION_GAIN = 0.97
-"""An effect must lower the error on blocks that it was not fitted to by 3 % at least, or it is not worth its name."""
-
-FORWARD_LIMIT = 1.02
-"""Nor may it make the end of the training record worse when it is fitted to the beginning alone."""
-
-DECISIVE, TOLERATED = 0.7, 1.7
-"""Where one event tells all, either measure may see little of it: an effect that lowers the one by 30 % may raise the
-other by as much as an event that it has not seen costs."""
-
-BETWEEN_SESSIONS = 0.5
-"""Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to, or it is the sessions
-that differ."""
-
-LUMPING_SHARE = 0.005
-"""What an effect changes must exceed this share of the temperatures' spread: below it a lumped network is no judge."""
+FORESIGHT = 0.97
+"""An effect must lower the error on what it was not fitted to by 3 % at least, or it is not worth its name."""
 
 UNEXPLAINED_SHARE = 1.0
 """Misfit over noise beyond which a record without a supported effect is called unexplained."""
 
-UNTOLD_STD = 1.0
-"""Relative deviation beyond which a quantity is not told: a mass of any size is a boundary, not a mass."""
-
-EXPLAINED_SHARE, EXPLAINED_SHARE_TOGETHER = 0.6, 0.85
-"""An effect must make this much of the latent heat's variance superfluous where it acts, several at once almost all of it,
-or something else is missing there."""
-
-HALVED = 0.5
-"""Several at once that more than halve both measures are worth their names like one that is alone."""
+REPEATABLE_SHARE = 0.1
+"""A name stands while the repeatable heat that it leaves is worth less than so much of its own evidence."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +88,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             continue
         validation = validate(state.trial, best.trial)
         own = replace(best, validation=validation)
-        if is_valid(validation, own.effects) and is_told(own) and not leaves_declaration(state.trial, own.trial):
+        if is_valid(validation):
             if _merely_resembles(state.trial, own, needed):
                 state.rejected.append(own)  # what explains less is no better a name for this heat
                 break
@@ -127,9 +106,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
     """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
     named = [effect for effect in judged.effects if not effect.fallback]
+    most = max(needed, REPEATABLE_SHARE * judged.evidence.log_bayes_factor)
     return bool(named) and (
-        leaves_a_repeatable_heat(judged.trial, named, needed)
-        or outdone_by_a_free_form(simple, judged.trial, named, needed)
+        leaves_a_repeatable_heat(judged.trial, named, needed, most)
+        or outdone_by_a_free_form(simple, judged.trial, named, needed, most)
     )
 
 
@@ -152,33 +132,12 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
     return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
 
 
-def is_told(judged: Judged) -> bool:
-    """Return whether the data tell what shapes the effects: no such quantity is as uncertain as it is large."""
-    shapes = [
-        f"{effect.label}.{quality.name}"
-        for effect in judged.effects
-        for quality in effect.qualities()
-        if quality.positive and quality.null is None and not quality.open_ended
-    ]
-    return all(judged.trial.free_std.get(name, 0.0) < UNTOLD_STD for name in shapes)
+def is_valid(validation: Validation) -> bool:
+    """Return whether effects predict what they were not fitted to: blocks from the others, the end from the beginning.
 
-
-def is_valid(validation: Validation, effects: Sequence[Effect]) -> bool:
-    """Return whether effects help where they were not fitted, by an amount that a lumped network can judge.
-
-    Several at once, or a free form, have more ways to please one measure alone, so they must please both. A law holds in
-    every session; an event does not.
+    One event may be seen by one of the two alone, so it is their geometric mean that must fall.
     """
-    blocks, forward = validation.ratio, validation.forward_ratio
-    both = blocks < VALIDATION_GAIN and forward < FORWARD_LIMIT
-    either = min(blocks, forward) < DECISIVE and max(blocks, forward) < TOLERATED
-    if validation.n_sessions > 1 and all(q.instant is None for effect in effects for q in effect.qualities()):
-        both = blocks < VALIDATION_GAIN and 1.0 - forward > BETWEEN_SESSIONS * (1.0 - blocks)
-        either = False
-    is_single = len(effects) == 1
-    share = EXPLAINED_SHARE if is_single or max(blocks, forward) < HALVED else EXPLAINED_SHARE_TOGETHER
-    matters = validation.removed_share > LUMPING_SHARE and validation.explained_share > share
-    return (both or (either and is_single and not effects[0].fallback)) and matters
+    return bool(np.sqrt(validation.ratio * validation.forward_ratio) < FORESIGHT)
 
 
 def worth(judged: Judged) -> float:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import combinations
 
 from twin_core._typing import Progress
-from twin_core.calibrate.latent_heat import gain_of_latent_heat
+from twin_core.calibrate.lumping import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
 from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
@@ -105,7 +105,9 @@ def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tu
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
     """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        quick = list(pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3), options))
+        quick = list(
+            pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3, quick=True), options)
+        )
         judged = sorted(quick, key=worth)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
@@ -144,9 +146,13 @@ def _acts_at(judged: Judged) -> set[str]:
     return {node for effect in judged.effects for node in touched_nodes(effect, layout)}
 
 
-def _judge(state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int) -> Judged:
+def _judge(
+    state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int, quick: bool = False
+) -> Judged:
     """Fit an option on top of the state's effects, started from a trial close by."""
-    trial = replace(try_effects(start, (*state.trial.effects, *option), n_passes=n_passes), simpler=state.trial)
+    trial = replace(
+        try_effects(start, (*state.trial.effects, *option), n_passes=n_passes, quick=quick), simpler=state.trial
+    )
     found = trial.effects[len(state.trial.effects) :]
     return Judged(found, weigh(state.trial, trial, n_tried), trial)
 

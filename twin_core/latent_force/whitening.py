@@ -10,7 +10,7 @@ from numba import njit
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 
-SETTLED = 1e-8
+SETTLED = 1e-7
 """A covariance that moves by less from sample to sample, in units of its deviations, has reached its limit."""
 
 
