@@ -138,7 +138,7 @@ def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         assert main(shlex.split(line)[1:]) == 0, line
     printed = capsys.readouterr().out
     (shown,) = blocks(section("README.md", "Quick start"), "text")
-    verdict, finding = shown.strip().splitlines()
-    assert verdict in printed
+    verdict, sentence, finding = shown.strip().splitlines()
+    assert verdict in printed and sentence in printed
     assert finding.split("(")[0] in printed
     assert (tmp_path / "forecast.csv").read_text().startswith("time,T_panel_mean,")

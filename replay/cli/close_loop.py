@@ -122,9 +122,11 @@ def _save(loop: "ClosedLoop", out: Path) -> None:
 def print_report(report: dict[str, Any]) -> None:
     """Print the verdict, the findings and the held-out error before and after."""
     from replay.cli.console import print_line, print_table, short
+    from twin_core.discover.phrasing import sentence
 
     print_line(f"{report['twin']}: {VERDICTS[report['verdict']]}")
     for finding in report["findings"]:
+        print_line(f"  {sentence(finding)}")
         print_line(f"  {describe(finding)}; log Bayes factor {short(finding['evidence']['log_bayes_factor'])}")
         for other in finding["alternatives"]:
             print_line(f"    cannot be told from {describe(other)}")

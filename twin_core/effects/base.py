@@ -220,7 +220,8 @@ class Effect(ABC):
     """Keys of ``where`` that may follow."""
     equation: ClassVar[str]
     reference: ClassVar[str]
-    words: ClassVar[str]
+    sentence: ClassVar[str]
+    """What a report says of it: ``{node}``, ``{sink}``, ``{first}`` and ``{second}`` of a pair, ... stand for its place."""
     reported_settings: ClassVar[tuple[str, ...]] = ()
     """Settings that the report lists beside the parameters where the effect has them, such as knots."""
     fallback: ClassVar[bool] = False
@@ -269,6 +270,20 @@ class Effect(ABC):
         """Name and place, unique in a model: ``radiation_to_sink(px,space)``."""
         places = [p for v in self.where.values() for p in ((v,) if isinstance(v, str) else v)]
         return f"{self.name}({','.join(places)})"
+
+    @classmethod
+    def told(cls, where: Mapping[str, Any]) -> str:
+        """Return the effect at a place as a sentence without capital and full stop: ``a conductor between a and b was missing``.
+
+        Raises
+        ------
+        KeyError
+            If ``where`` lacks a key that the sentence names.
+        """
+        names = {key: value for key, value in where.items() if isinstance(value, str)}
+        if "nodes" in where:
+            names["first"], names["second"] = where["nodes"]
+        return cls.sentence.format(**names)
 
     @property
     def place(self) -> tuple[str, frozenset[tuple[str, Any]]]:
