@@ -93,6 +93,13 @@ class CoreWorkbench:
             raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
         return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
 
+    def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant."""
+        from twin_core.assimilate import memory_s
+
+        model = _cached_model(document)
+        return memory_s(model, _record(model.spec, telemetry))
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Look for samples that are no readings."""
         from twin_core.quality import screen

@@ -55,10 +55,27 @@ class TwinInfo(_Answer):
     channels: list[str]
 
 
+class Assimilation(_Answer):
+    """How far the active model has followed the archive: ``done`` of ``of`` samples, the rest in the background.
+
+    ``state_time`` is the instant of the present state, ``behind_s`` by how many seconds of telemetry that lies before the
+    last sample.
+    """
+
+    done: int
+    of: int
+    state_time: Instant | None
+    behind_s: float
+
+
 class TwinDetail(TwinInfo):
-    """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found."""
+    """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found.
+
+    ``assimilation`` is null without an active model, or where nothing is assimilated.
+    """
 
     catching_up: bool = False
+    assimilation: Assimilation | None = None
     specification: dict[str, Any]
 
 
@@ -213,12 +230,14 @@ class Whole(_Answer):
 class Forecast(_Answer):
     """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit.
 
-    ``inputs`` says where the future of each input and boundary channel comes from, ``behind_s`` by how many seconds of
-    telemetry the state that the forecast starts from lags behind the archive.
+    ``inputs`` says where the future of each input and boundary channel comes from, ``from`` at which instant the forecast
+    starts, ``behind_s`` by how many seconds of telemetry that lies before the last sample.
     """
 
     model_version: int
     issued: Instant
+    from_: Instant | None = Field(default=None, alias="from")
+    behind_s: float = 0.0
     time: list[Instant]
     values: dict[str, dict[str, list[float]]]
     whole: Whole | None = None

@@ -148,6 +148,9 @@ class Workbench(Protocol):
     def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Filter a stretch of telemetry; with a state its first sample is the one that the state already knows."""
 
+    def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant of a model in seconds, linearised where the telemetry begins."""
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples of channels in these units are no readings."""
 

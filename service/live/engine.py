@@ -35,6 +35,10 @@ class Engine:
         """Filter a stretch of telemetry."""
         return await self._ask(_assimilate, self._workbench, document, telemetry, state)
 
+    async def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant of a model."""
+        return await self._ask(_memory_s, self._workbench, document, telemetry)
+
     async def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples are no readings."""
         return await self._ask(_screen, self._workbench, dict(units), telemetry)
@@ -80,6 +84,10 @@ def _start(workers: int) -> ProcessPoolExecutor:
 
 def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
     return workbench().assimilate(document, telemetry, state)
+
+
+def _memory_s(workbench: type[Workbench], document: str, telemetry: Telemetry) -> float:
+    return workbench().memory_s(document, telemetry)
 
 
 def _screen(workbench: type[Workbench], units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:

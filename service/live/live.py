@@ -44,9 +44,9 @@ class Live:
             )
         return tracker
 
-    def catching_up(self, twin: str) -> bool:
-        """Return whether many samples of a twin, or those before its model became active, are still to be assimilated."""
-        return any(tracker.catching_up for tracker in self._trackers.values() if tracker.twin.name == twin)
+    def find(self, twin: int) -> Tracker | None:
+        """Return the tracker of a twin, None if nothing follows its samples."""
+        return self._trackers.get(twin)
 
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""

@@ -317,3 +317,51 @@ def block_stop(connection: sqlite3.Connection, twin: int, start_us: int | None, 
         if total >= n_rows:
             return int(last_us) + 1
     return None
+
+
+def count_after(connection: sqlite3.Connection, twin: int, after_us: int | None) -> int:
+    """Return how many samples lie behind an instant; those that came in pieces count as often."""
+    after = -(2**62) if after_us is None else after_us
+    query = "SELECT coalesce(sum(n), 0) FROM chunk WHERE twin = ? AND last_us > ? AND first_us > ?"
+    count = int(connection.execute(query, (twin, after, after)).fetchone()[0])
+    query = "SELECT time FROM chunk WHERE twin = ? AND last_us > ? AND first_us <= ?"
+    for (time,) in connection.execute(query, (twin, after, after)):
+        count += int((np.frombuffer(time, dtype="<i8") > after).sum())
+    return count
+
+
+def newest(connection: sqlite3.Connection, twin: int, n_channels: int, count: int) -> Samples:
+    """Return the last ``count`` samples of the archive, or all if there are fewer."""
+    found, start_us = 0, -(2**62)
+    query = "SELECT first_us, n FROM chunk WHERE twin = ? ORDER BY last_us DESC"
+    for first_us, n in connection.execute(query, (twin,)):
+        found, start_us = found + n, first_us if found == 0 else min(start_us, first_us)
+        if found >= 2 * count:  # chunks may overlap: one that began earlier may end later
+            break
+    else:
+        start_us = -(2**62)
+    held = select(connection, twin, n_channels, range(n_channels), start_us)
+    return Samples(held.time_us[-count:], held.values[:, -count:])
+
+
+MOST_SEARCHED = 256
+"""Chunks, some millions of samples, that are searched for the last value of a channel."""
+
+
+def last_values(
+    connection: sqlite3.Connection, twin: int, n_channels: int, rows: Sequence[int], before_us: int
+) -> dict[int, float]:
+    """Return the last value before an instant of each channel whose position ``rows`` names; absent where none is found."""
+    found: dict[int, tuple[int, float]] = {}
+    query = """SELECT last_us, time, value FROM chunk WHERE twin = ? AND first_us < ?
+               ORDER BY last_us DESC LIMIT ?"""
+    for last_us, time, value in connection.execute(query, (twin, before_us, MOST_SEARCHED)):
+        if len(found) == len(rows) and last_us < min(instant for instant, _ in found.values()):
+            break
+        time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)
+        for row in rows:
+            at = np.flatnonzero((time_us < before_us) & np.isfinite(matrix[row]))
+            if at.size:
+                best = at[np.argmax(time_us[at])]
+                found[row] = max(found.get(row, (-(2**62), 0.0)), (int(time_us[best]), float(matrix[row, best])))
+    return {row: value for row, (_, value) in found.items()}
