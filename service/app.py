@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -26,7 +27,7 @@ from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
 from service.streams import Hub
-from service.workbench import Workbench
+from service.workbench import MakeWorkbench
 
 log = logging.getLogger("service")
 
@@ -43,7 +44,7 @@ ROUTERS = (
 
 @contextlib.asynccontextmanager
 async def _running(
-    settings: Settings, database: Database, metrics: Metrics, workbench: type[Workbench]
+    settings: Settings, database: Database, metrics: Metrics, workbench: MakeWorkbench
 ) -> AsyncIterator[Service]:
     """Start everything that works in the background, and stop it in the opposite order."""
     interrupted = await database.write(job_table.fail_interrupted)
@@ -84,7 +85,7 @@ def _describe_access(app: FastAPI) -> None:
 def create_app(
     settings: Settings | None = None,
     database: Database | None = None,
-    workbench: type[Workbench] = CoreWorkbench,
+    workbench: MakeWorkbench | None = None,
 ) -> FastAPI:
     """Return the application; the store is opened when it starts, unless it is handed over open, and closed at the end.
 
@@ -94,13 +95,14 @@ def create_app(
         If the settings are wrong or would leave the service open to strangers.
     """
     settings = settings or read_settings()
+    make_workbench = workbench or partial(CoreWorkbench, settings.effect_files)
     metrics = Metrics()
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = database or Database(settings.database_path)
         try:
-            async with _running(settings, store, metrics, workbench) as service:
+            async with _running(settings, store, metrics, make_workbench) as service:
                 app.state.service = service
                 yield
         finally:

@@ -161,6 +161,10 @@ class Workbench(Protocol):
         """Return temperatures and heat flows of the moment that the state describes."""
 
 
-def work(workbench: type[Workbench], function: str, task: Any, progress: Progress) -> Any:
+MakeWorkbench = Callable[[], Workbench]
+"""What makes a workbench in a worker process; it travels there."""
+
+
+def work(workbench: MakeWorkbench, function: str, task: Any, progress: Progress) -> Any:
     """Do one task; worker processes find this function by its name."""
     return getattr(workbench(), function)(task, progress)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
     from twin_core.discover import ClosedLoop
@@ -40,6 +41,7 @@ VERDICTS = {
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
+@effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def close_loop(
     spec_file: Path,

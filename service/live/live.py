@@ -7,7 +7,7 @@ from service.problems import Problem
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
-from service.workbench import Json, Outcome, Workbench
+from service.workbench import Json, MakeWorkbench, Outcome
 from twin_core.anomaly import Thresholds
 
 
@@ -15,7 +15,7 @@ class Live:
     """Every tracker of this service."""
 
     def __init__(
-        self, database: Database, hub: Hub, metrics: Metrics, workbench: type[Workbench], false_alarm_rate: float
+        self, database: Database, hub: Hub, metrics: Metrics, workbench: MakeWorkbench, false_alarm_rate: float
     ) -> None:
         """Start without twins."""
         self.engine = Engine(workbench)
