@@ -14,6 +14,7 @@ from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
 from service.deps import Service, known_parameters
 from service.heads import Heads
+from service.housekeeping import Housekeeping
 from service.intake import Intake
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
@@ -33,6 +34,7 @@ log = logging.getLogger("service")
 
 ROUTERS = (
     telemetry.router,
+    telemetry.quarantine,
     twins.router,
     jobs.calibrations,
     jobs.diagnoses,
@@ -55,16 +57,18 @@ async def _running(
     runner = Jobs(
         database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
     )
-    intake = Intake(hub, live_state, metrics)
+    intake = Intake(hub, live_state, metrics, settings.clock_tolerance_s)
     service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
+    housekeeping = Housekeeping(database)
     schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
     try:
         yield service
     finally:
         hub.close()
         await schedule.close()
+        await housekeeping.close()
         await runner.close()
         await live_state.close()
 

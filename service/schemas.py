@@ -43,7 +43,7 @@ class _Answer(BaseModel):
 
 
 class TwinInfo(_Answer):
-    """A registered twin. Times are null while its archive is empty."""
+    """A registered twin. Times are null while its archive is empty; ``quarantined`` samples are not part of it."""
 
     id: str
     created: Instant
@@ -51,6 +51,7 @@ class TwinInfo(_Answer):
     first_time: Instant | None
     last_time: Instant | None
     active_model: int | None
+    quarantined: int = 0
     seq: int
     channels: list[str]
 
@@ -93,12 +94,52 @@ class Rejection(_Answer):
 
 
 class IngestReport(_Answer):
-    """What became of the samples of one request."""
+    """What became of the samples of one request.
+
+    Those in ``quarantined``, which is there where any are, lie ahead of the receive clock: they are kept, but not in the archive.
+    """
 
     accepted: int
     duplicates: int
     rejected: list[Rejection]
+    quarantined: list[Rejection] = []
     last_time: Instant | None
+
+
+class Interval(_Request):
+    """start <= time < stop; absent: without an end on that side."""
+
+    start: Time | None = None
+    stop: Time | None = None
+
+
+class Deletion(_Answer):
+    """What was deleted, from the ``archive`` or the ``quarantine``; it can be undone until ``undo_until``, once."""
+
+    id: int
+    time: Instant
+    place: Literal["archive", "quarantine"]
+    start: Instant | None
+    stop: Instant | None
+    channels: list[str] | None
+    samples: int
+    undone: Instant | None
+    undo_until: Instant | None
+
+
+class DeletionList(_Answer):
+    """Deletions of one twin, the newest first."""
+
+    deletions: list[Deletion]
+
+
+class Quarantine(_Answer):
+    """Samples that lie ahead of the present, in the order of their arrival; ``samples`` are there in all."""
+
+    samples: int
+    time: list[Instant]
+    received: list[Instant]
+    values: dict[str, list[float | None]]
 
 
 class Columns(BaseModel):
@@ -300,6 +341,6 @@ class AnomalyList(_Answer):
 class Message(_Answer):
     """One message of a stream."""
 
-    type: Literal["sample", "residual", "anomaly", "job", "model", "dropped"]
+    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "dropped"]
     seq: int
     time: Instant

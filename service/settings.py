@@ -43,6 +43,12 @@ class Settings(BaseSettings):
         2e-8, gt=0, le=1e-4, description="Chance that a statistic of a healthy sensor alarms at one sample."
     )
     effects: str = Field("", description="Plug-ins with effects of your own: Python files, separated by colons.")
+    clock_tolerance_s: float = Field(
+        300.0,
+        ge=0,
+        le=1e9,
+        description="Samples further ahead of this machine's clock go into quarantine; 0: none does.",
+    )
     log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
 
     @field_validator("database_url")

@@ -65,6 +65,7 @@ class Following:
         done: Followed,
         seq: int,
         told: NDArray[np.bool_],
+        revision: int,
         *,
         is_provisional: bool = False,
     ) -> tuple[Position, Step]:
@@ -82,6 +83,8 @@ class Following:
             The number at which the stream stood when the archive was read.
         told : (n_times,)
             Which samples nobody was told about yet.
+        revision
+            Of the archive when it was read.
         is_provisional
             Whether the archive before the block was left out, to be assimilated later.
         """
@@ -99,5 +102,6 @@ class Following:
         recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
         after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, detector, recent_us)
         checkpoint = None if is_provisional else after.checkpoint()
-        step = Step(active.version, after_us, after_gap, time_us, innovation, std, nis, told, changes, checkpoint)
+        found = (time_us, innovation, std, nis, told, changes)
+        step = Step(active.version, revision, after_us, after_gap, *found, checkpoint)
         return after, step

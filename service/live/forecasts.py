@@ -124,11 +124,15 @@ def quantile_name(probability: float) -> str:
 
 @dataclass(frozen=True)
 class Behind:
-    """How far a state lags: ``seconds`` of telemetry, while of ``of`` samples of the archive ``done`` are assimilated."""
+    """How far a state lags: ``seconds`` of telemetry, while of ``of`` samples of the archive ``done`` are assimilated.
+
+    ``quarantined`` more lie ahead of the present.
+    """
 
     seconds: float
     done: int
     of: int
+    quarantined: int
 
 
 async def behind(tracker: Tracker, database: Database) -> Behind:
@@ -138,7 +142,7 @@ async def behind(tracker: Tracker, database: Database) -> Behind:
     lag_us = 0
     if position is not None and last_us is not None and last_us != tracker.waits_us:
         lag_us = max(last_us - position.time_us, 0)
-    return Behind(lag_us / 1e6, max(head.samples - tracker.left, 0), head.samples)
+    return Behind(lag_us / 1e6, max(head.samples - tracker.left, 0), head.samples, head.quarantined)
 
 
 def notices(tracker: Tracker, position: Position, lag: Behind) -> list[str]:
@@ -160,6 +164,10 @@ def notices(tracker: Tracker, position: Position, lag: Behind) -> list[str]:
         when = format_instant(tracker.waits_us)
         told.append(
             f"the last sample, of {when}, lies far ahead of the others and waits for another one: its clock may be wrong"
+        )
+    if lag.quarantined:
+        told.append(
+            f"{lag.quarantined} sample(s) ahead of the receive clock are in quarantine and take no part: its clock may be wrong"
         )
     return told
 

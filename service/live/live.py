@@ -54,6 +54,12 @@ class Live:
         if tracker is not None:
             tracker.arrived()
 
+    def archive_changed(self, twin: Entry) -> None:
+        """Pass on that stored samples were taken away."""
+        tracker = self._trackers.get(twin.key)
+        if tracker is not None:
+            tracker.archive_changed()
+
     def model_changed(self, twin: int) -> None:
         """Pass on that another model is active."""
         tracker = self._trackers.get(twin)

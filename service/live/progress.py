@@ -24,14 +24,20 @@ Json = dict[str, Any]
 _NONE = np.empty(0, dtype=np.int64)
 
 
+class Outdated(Exception):
+    """What was assimilated is no longer in the archive."""
+
+
 @dataclass(frozen=True)
 class Step:
     """What one step of assimilation found: ``after_us`` is the instant before it, ``after_gap`` whether that is long ago.
 
-    ``checkpoint`` is None where the archive before it was left out: nothing may go on from there after a restart.
+    ``revision`` is that of the archive that was read; ``checkpoint`` is None where the archive before was left out: nothing
+    may go on from there after a restart.
     """
 
     version: int
+    revision: int
     after_us: int
     after_gap: bool
     time_us: NDArray[np.int64]
@@ -66,6 +72,8 @@ class Reading:
         Which of them nobody was told about yet.
     left
         How many samples lie beyond the position.
+    revision
+        How often samples had been taken out of the archive.
     """
 
     seq: int
@@ -74,13 +82,16 @@ class Reading:
     fresh: Samples
     told: NDArray[np.bool_]
     left: int
+    revision: int
 
 
 def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:
     """Store a step; residuals of samples that arrived live get stream numbers, the others zero.
 
-    What was said provisionally of the same time is replaced.
+    What was said provisionally of the same time is replaced. Outdated if samples were taken away meanwhile.
     """
+    if samples.revision(connection, twin.key) != step.revision:
+        raise Outdated(f"samples of '{twin.name}' were taken away while they were assimilated")
     n_told = int(step.told.sum())
     seq = np.zeros(step.time_us.size, dtype=np.int64)
     stretches: list[Stretch] = []
@@ -164,14 +175,14 @@ def look(
     first = _first_in_company(connection, twin.key, np.unique(np.concatenate([*late, _NONE])), longest_gap_us)
     after_us = read[-1][1] if read else None
     known_us = None if first is None else _next_record(connection, twin.key, first, read[-1][1], longest_gap_us)
-    fresh, told = ahead(connection, twin, after_us, told_seq, most, until_us)
-    return Reading(seq, first, known_us, fresh, told, samples.count_after(connection, twin.key, after_us))
+    fresh, told, revision = ahead(connection, twin, after_us, told_seq, most, until_us)
+    return Reading(seq, first, known_us, fresh, told, samples.count_after(connection, twin.key, after_us), revision)
 
 
 def ahead(
     connection: sqlite3.Connection, twin: Entry, after_us: int | None, told_seq: int, most: int, until_us: int | None
-) -> tuple[Samples, NDArray[np.bool_]]:
-    """Return the next samples after an instant, all channels, and which of them nobody was told about yet."""
+) -> tuple[Samples, NDArray[np.bool_], int]:
+    """Return the next samples after an instant, which of them nobody was told about yet, and the archive's revision."""
     stop_us = samples.block_stop(connection, twin.key, after_us, most)
     if until_us is not None:
         stop_us = until_us if stop_us is None else min(stop_us, until_us)
@@ -182,7 +193,7 @@ def ahead(
     if fresh.time_us.size:
         span = (int(fresh.time_us[0]), int(fresh.time_us[-1]) + 1)
         told = np.isin(fresh.time_us, samples.arrived(connection, twin.key, told_seq, *span))
-    return fresh, told
+    return fresh, told, samples.revision(connection, twin.key)
 
 
 def outdates_inputs(

@@ -102,7 +102,7 @@ class Scout:
         if await self._database.read(samples.count_after, self._twin.key, self._after_us) > 2 * MOST:
             await self.begin()
         arguments = (self._twin, self._after_us, told_seq, max(self._caution.most, 2), None)
-        found, told = await self._database.read(ahead, *arguments)
+        found, told, revision = await self._database.read(ahead, *arguments)
         count = next_count(found.time_us, self._active.longest_gap_us)
         if count == found.time_us.size > 0 and is_far(found.time_us, self._before, self._active.longest_gap_us):
             count -= 1
@@ -123,7 +123,7 @@ class Scout:
         self._caution.succeeded()
         after_us = self._after_us if before is None else before.time_us
         position, step = self._following.step(
-            self._active, before, after_us, done, 0, told[: fresh.time_us.size], is_provisional=True
+            self._active, before, after_us, done, 0, told[: fresh.time_us.size], revision, is_provisional=True
         )
         await self._hub.write(self._twin.key, save, self._twin, step)
         self.position = self._before = position

@@ -4,15 +4,13 @@ import asyncio
 import logging
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from service.instants import format_instant
 from service.live import progress
 from service.live.caution import Caution, Rest
 from service.live.engine import Engine
 from service.live.following import Followed, Following
 from service.live.position import Position, is_far, next_count
+from service.live.progress import Outdated, Reading
 from service.live.scout import Base, Scout
 from service.metrics import Metrics
 from service.problems import Problem
@@ -80,7 +78,7 @@ class Tracker:
         """What was read of the archive, see ``look``."""
         self._detour: _Detour | None = None
         self._rest = Rest()
-        self._told_seq, self._new_model = 0, True
+        self._told_seq, self._new_model, self._begin_anew = 0, True, False
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
         self._task = asyncio.create_task(self._run())
@@ -109,6 +107,11 @@ class Tracker:
         self._new_model = True
         self._idle.clear()
         self._wake.set()
+
+    def archive_changed(self) -> None:
+        """Hear that stored samples were taken away: go back to before them."""
+        self._begin_anew = True
+        self.model_changed()
 
     async def settled(self, timeout_s: float) -> bool:
         """Return whether everything stored so far is assimilated, after waiting for it a while."""
@@ -144,11 +147,20 @@ class Tracker:
     async def _take_in(self) -> None:
         if self._new_model:
             await self._load()
-        while self.active is not None and await self._advance(self.active):
-            if self._scout is not None:
-                await self._look_ahead(self._scout)
+        while self.active is not None and await self._go_on(self.active):
             if self._new_model:
                 await self._load()
+
+    async def _go_on(self, active: Active) -> bool:
+        """Assimilate the next block, and what came meanwhile; return whether there may be more."""
+        try:
+            if not await self._advance(active):
+                return False
+            if self._scout is not None:
+                await self._look_ahead(self._scout)
+        except Outdated:
+            self._new_model = self._begin_anew = True
+        return True
 
     async def _look_ahead(self, scout: Scout) -> None:
         """Let the scout follow what came meanwhile."""
@@ -165,14 +177,14 @@ class Tracker:
 
     async def _load(self) -> None:
         """Find the active model and where its assimilation stands."""
-        self._new_model = False
+        self._new_model, anew, self._begin_anew = False, self._begin_anew, False
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
             self.active, self.catching_up, self._detour = None, False, None
             self._scout, self._passed, self.left = None, None, 0
             self._stand(None)
             return
-        if self.active is not None and self.active.version == active.version:
+        if self.active is not None and self.active.version == active.version and not anew:
             return
         checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
         self._caution, self.trouble, self.catching_up = Caution(), None, True
@@ -236,7 +248,7 @@ class Tracker:
         caution.succeeded()
         self.trouble = None
         seq = before.seq if before is not None and reading.late_us is not None else reading.seq
-        await self._keep(active, before, done, seq, reading.told)
+        await self._keep(active, before, done, seq, reading)
         return True
 
     async def _send_scout(self, active: Active) -> Scout:
@@ -289,17 +301,15 @@ class Tracker:
             log.warning("a lone sample far ahead of the others waits for company", extra=extra)
         self.waits_us = instant_us
 
-    async def _keep(
-        self, active: Active, before: Position | None, done: Followed, seq: int, told: NDArray[np.bool_]
-    ) -> None:
+    async def _keep(self, active: Active, before: Position | None, done: Followed, seq: int, reading: Reading) -> None:
         """Look for anomalies in a filtered block and write everything down."""
         time_us = done.seen.time_us
         after_us = _EVER if before is None else before.time_us
         scouted = None if self._scout is None else self._scout.position
-        told = (told[: time_us.size] | (time_us == self.waits_us)) & (
+        told = (reading.told[: time_us.size] | (time_us == self.waits_us)) & (
             time_us > (_EVER if scouted is None else scouted.time_us)
         )
-        after, step = self._following.step(active, before, after_us, done, seq, told)
+        after, step = self._following.step(active, before, after_us, done, seq, told, reading.revision)
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
         self._metrics.assimilated.inc(int(time_us.size))
         self.left = max(self.left - int(time_us.size), 0)

@@ -27,6 +27,7 @@ def _info(twin: Twin) -> dict[str, Any]:
         "first_time": _when(twin.first_us),
         "last_time": _when(twin.last_us),
         "active_model": twin.active_version,
+        "quarantined": twin.quarantined,
         "seq": twin.seq,
         "channels": list(twin.channels),
     }
