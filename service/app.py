@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from collections.abc import AsyncIterator
+from functools import partial
 from typing import Any
 
 from fastapi import Depends, FastAPI
@@ -13,6 +14,7 @@ from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
 from service.deps import Service, known_parameters
 from service.heads import Heads
+from service.housekeeping import Housekeeping
 from service.intake import Intake
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
@@ -26,12 +28,13 @@ from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
 from service.streams import Hub
-from service.workbench import Workbench
+from service.workbench import MakeWorkbench
 
 log = logging.getLogger("service")
 
 ROUTERS = (
     telemetry.router,
+    telemetry.quarantine,
     twins.router,
     jobs.calibrations,
     jobs.diagnoses,
@@ -43,7 +46,7 @@ ROUTERS = (
 
 @contextlib.asynccontextmanager
 async def _running(
-    settings: Settings, database: Database, metrics: Metrics, workbench: type[Workbench]
+    settings: Settings, database: Database, metrics: Metrics, workbench: MakeWorkbench
 ) -> AsyncIterator[Service]:
     """Start everything that works in the background, and stop it in the opposite order."""
     interrupted = await database.write(job_table.fail_interrupted)
@@ -54,16 +57,18 @@ async def _running(
     runner = Jobs(
         database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
     )
-    intake = Intake(hub, live_state, metrics)
+    intake = Intake(hub, live_state, metrics, settings.clock_tolerance_s)
     service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
+    housekeeping = Housekeeping(database)
     schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
     try:
         yield service
     finally:
         hub.close()
         await schedule.close()
+        await housekeeping.close()
         await runner.close()
         await live_state.close()
 
@@ -84,7 +89,7 @@ def _describe_access(app: FastAPI) -> None:
 def create_app(
     settings: Settings | None = None,
     database: Database | None = None,
-    workbench: type[Workbench] = CoreWorkbench,
+    workbench: MakeWorkbench | None = None,
 ) -> FastAPI:
     """Return the application; the store is opened when it starts, unless it is handed over open, and closed at the end.
 
@@ -94,13 +99,14 @@ def create_app(
         If the settings are wrong or would leave the service open to strangers.
     """
     settings = settings or read_settings()
+    make_workbench = workbench or partial(CoreWorkbench, settings.effect_files)
     metrics = Metrics()
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = database or Database(settings.database_path)
         try:
-            async with _running(settings, store, metrics, workbench) as service:
+            async with _running(settings, store, metrics, make_workbench) as service:
                 app.state.service = service
                 yield
         finally:

@@ -1,8 +1,9 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,13 @@ from twin_core.errors import ModelError
 
 class CoreWorkbench:
     """The workbench of ``twin_core``."""
+
+    def __init__(self, effects: Sequence[Path] = ()) -> None:
+        """Know the effects of plug-in files; PluginError names the file that cannot be used."""
+        if effects:
+            from twin_core.effects import load_effects
+
+            load_effects(effects)
 
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
         """Fit the declared network."""
@@ -92,6 +100,13 @@ class CoreWorkbench:
         if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
             raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
         return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
+
+    def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant."""
+        from twin_core.assimilate import memory_s
+
+        model = _cached_model(document)
+        return memory_s(model, _record(model.spec, telemetry))
 
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Look for samples that are no readings."""

@@ -29,10 +29,22 @@ class Batch:
         Microseconds since 1970.
     values : (n_channels, n_times)
         In the channels' own units, rows in the order of the twin's channels; NaN is a missing sample.
+    received_us
+        When each arrived, (n_times,) microseconds since 1970 of this machine's clock; None where nobody noted it.
     """
 
     time_us: Instants
     values: NDArray[np.float64]
+    received_us: Instants | None = None
+
+    @property
+    def received(self) -> Instants:
+        """When each sample arrived, (n_times,); 0 where nobody noted it."""
+        return np.zeros_like(self.time_us) if self.received_us is None else self.received_us
+
+    def take(self, keep: NDArray[np.bool_]) -> "Batch":
+        """Return the samples that a mask selects."""
+        return Batch(self.time_us[keep], self.values[:, keep], self.received[keep])
 
 
 MOST_VALUES = 2**24

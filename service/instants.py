@@ -4,6 +4,7 @@ import re
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -164,3 +165,15 @@ def format_instant(instant: int) -> str:
 def now_us() -> int:
     """Return the wall clock in microseconds since 1970."""
     return time.time_ns() // 1000
+
+
+_UNITS = (("d", 86_400.0), ("h", 3600.0), ("min", 60.0))
+
+
+def in_words(seconds: float) -> str:
+    """Return a length of time as an operator says it: ``2 h 40 min``, ``3 d 4 h``, ``12 s``."""
+    for (name, length), (next_name, next_length) in pairwise((*_UNITS, ("s", 1.0))):
+        if round(seconds / next_length) * next_length >= length:
+            whole, rest = divmod(round(seconds / next_length), round(length / next_length))
+            return f"{whole} {name} {rest} {next_name}" if rest else f"{whole} {name}"
+    return f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.2g} s"

@@ -4,6 +4,7 @@ What a commit costs beside the disk (statements, hand-overs between threads) is 
 """
 
 import asyncio
+import logging
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,16 +15,20 @@ from typing import NamedTuple
 import numpy as np
 
 from service.frames import MOST_VALUES, Batch
+from service.instants import now_us
 from service.live.live import Live
 from service.messages import SampleStretch
 from service.metrics import Metrics
 from service.registry import Entry
 from service.store import samples
-from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
+from service.store.admission import admit
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Receipt
 from service.streams import Hub, settle
 
-OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT}
+log = logging.getLogger("service")
+
+OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT, "quarantined": QUARANTINED}
 
 
 class _Ticket(NamedTuple):
@@ -36,15 +41,17 @@ class _Ticket(NamedTuple):
 class Intake:
     """Stores samples, each twin's in the order of their arrival."""
 
-    def __init__(self, hub: Hub, live: Live, metrics: Metrics) -> None:
-        """Tell streams, trackers and metrics what was stored."""
+    def __init__(self, hub: Hub, live: Live, metrics: Metrics, clock_tolerance_s: float) -> None:
+        """Tell streams, trackers and metrics what was stored; samples may be ahead of this machine's clock by a tolerance."""
         self._hub, self._live, self._metrics = hub, live, metrics
+        self._tolerance_us = round(clock_tolerance_s * 1e6)
         self._loop = asyncio.get_running_loop()
         self._lines: dict[int, list[_Ticket]] = {}
         """Of each twin with a commit under way or about to begin: what waits for the next one."""
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
+        batch = replace(batch, received_us=np.full(batch.time_us.size, now_us()))
         ticket = _Ticket(batch, self._loop.create_future())
         if twin.key not in self._lines:
             self._lines[twin.key] = []
@@ -60,7 +67,9 @@ class Intake:
         tickets, self._lines[twin.key] = line[:n_first], line[n_first:]
         if tickets:
             batch = _joined([ticket.batch for ticket in tickets])
-            self._hub.submit_then(partial(self._done, twin, tickets), twin.key, _append, twin, batch)
+            self._hub.submit_then(
+                partial(self._done, twin, tickets), twin.key, take_in, twin, batch, self._tolerance_us
+            )
         else:
             del self._lines[twin.key]
 
@@ -81,6 +90,11 @@ class Intake:
         for outcome, status in OUTCOMES.items():
             if counts[status]:
                 self._metrics.samples.labels(twin.name, outcome).inc(counts[status])
+        if receipt.moved:
+            log.warning(
+                "samples ahead of the present go into quarantine", extra={"twin": twin.name, "n": receipt.moved}
+            )
+            self._live.archive_changed(twin)
         if counts[ACCEPTED]:
             self._live.arrived(twin)
 
@@ -89,13 +103,14 @@ def _joined(batches: list[Batch]) -> Batch:
     """Return batches as one, in their order."""
     if len(batches) == 1:
         return batches[0]
-    times, values = [batch.time_us for batch in batches], [batch.values for batch in batches]
-    return Batch(np.concatenate(times), np.concatenate(values, axis=1))
+    return samples.joined(batches, batches[0].values.shape[0])
 
 
-def _append(connection: sqlite3.Connection, twin: Entry, batch: Batch) -> tuple[Receipt, Sequence[SampleStretch]]:
-    """Store a batch; return what became of it, and what the stream hears."""
-    receipt = samples.append(connection, twin.key, batch)
+def take_in(
+    connection: sqlite3.Connection, twin: Entry, batch: Batch, tolerance_us: int
+) -> tuple[Receipt, Sequence[SampleStretch]]:
+    """Store a batch; return what became of it, and what the stream hears. A tolerance of 0 takes in what lies ahead, too."""
+    receipt = admit(connection, twin.key, batch, tolerance_us)
     n_stored = receipt.counts[ACCEPTED]
     if n_stored == 0:
         return receipt, ()

@@ -43,7 +43,7 @@ class _Answer(BaseModel):
 
 
 class TwinInfo(_Answer):
-    """A registered twin. Times are null while its archive is empty."""
+    """A registered twin. Times are null while its archive is empty; ``quarantined`` samples are not part of it."""
 
     id: str
     created: Instant
@@ -51,14 +51,32 @@ class TwinInfo(_Answer):
     first_time: Instant | None
     last_time: Instant | None
     active_model: int | None
+    quarantined: int = 0
     seq: int
     channels: list[str]
 
 
+class Assimilation(_Answer):
+    """How far the active model has followed the archive: ``done`` of ``of`` samples, the rest in the background.
+
+    ``state_time`` is the instant of the present state, ``behind_s`` by how many seconds of telemetry that lies before the
+    last sample.
+    """
+
+    done: int
+    of: int
+    state_time: Instant | None
+    behind_s: float
+
+
 class TwinDetail(TwinInfo):
-    """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found."""
+    """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found.
+
+    ``assimilation`` is null without an active model, or where nothing is assimilated.
+    """
 
     catching_up: bool = False
+    assimilation: Assimilation | None = None
     specification: dict[str, Any]
 
 
@@ -76,12 +94,52 @@ class Rejection(_Answer):
 
 
 class IngestReport(_Answer):
-    """What became of the samples of one request."""
+    """What became of the samples of one request.
+
+    Those in ``quarantined``, which is there where any are, lie ahead of the receive clock: they are kept, but not in the archive.
+    """
 
     accepted: int
     duplicates: int
     rejected: list[Rejection]
+    quarantined: list[Rejection] = []
     last_time: Instant | None
+
+
+class Interval(_Request):
+    """start <= time < stop; absent: without an end on that side."""
+
+    start: Time | None = None
+    stop: Time | None = None
+
+
+class Deletion(_Answer):
+    """What was deleted, from the ``archive`` or the ``quarantine``; it can be undone until ``undo_until``, once."""
+
+    id: int
+    time: Instant
+    place: Literal["archive", "quarantine"]
+    start: Instant | None
+    stop: Instant | None
+    channels: list[str] | None
+    samples: int
+    undone: Instant | None
+    undo_until: Instant | None
+
+
+class DeletionList(_Answer):
+    """Deletions of one twin, the newest first."""
+
+    deletions: list[Deletion]
+
+
+class Quarantine(_Answer):
+    """Samples that lie ahead of the present, in the order of their arrival; ``samples`` are there in all."""
+
+    samples: int
+    time: list[Instant]
+    received: list[Instant]
+    values: dict[str, list[float | None]]
 
 
 class Columns(BaseModel):
@@ -213,12 +271,14 @@ class Whole(_Answer):
 class Forecast(_Answer):
     """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit.
 
-    ``inputs`` says where the future of each input and boundary channel comes from, ``behind_s`` by how many seconds of
-    telemetry the state that the forecast starts from lags behind the archive.
+    ``inputs`` says where the future of each input and boundary channel comes from, ``from`` at which instant the forecast
+    starts, ``behind_s`` by how many seconds of telemetry that lies before the last sample.
     """
 
     model_version: int
     issued: Instant
+    from_: Instant | None = Field(default=None, alias="from")
+    behind_s: float = 0.0
     time: list[Instant]
     values: dict[str, dict[str, list[float]]]
     whole: Whole | None = None
@@ -281,6 +341,6 @@ class AnomalyList(_Answer):
 class Message(_Answer):
     """One message of a stream."""
 
-    type: Literal["sample", "residual", "anomaly", "job", "model", "dropped"]
+    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "dropped"]
     seq: int
     time: Instant

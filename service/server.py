@@ -11,11 +11,10 @@ from collections.abc import Callable
 import uvicorn
 
 from service.app import create_app
-from service.core_workbench import CoreWorkbench
 from service.patience import patient
 from service.settings import Settings, unknown_variables
 from service.store.database import Database
-from service.workbench import Workbench
+from service.workbench import MakeWorkbench
 from twin_core.errors import TwinError
 
 log = logging.getLogger("service")
@@ -32,7 +31,7 @@ class ServerError(TwinError):
 def serve(
     settings: Settings,
     on_ready: Callable[[str], None] | None = None,
-    workbench: type[Workbench] = CoreWorkbench,
+    workbench: MakeWorkbench | None = None,
 ) -> None:
     """Serve until interrupted.
 
@@ -43,15 +42,19 @@ def serve(
     on_ready
         Called with the URL once the service answers.
     workbench
-        Who does the science.
+        What makes whoever does the science; ``twin_core`` with the plug-ins of the settings by default.
 
     Raises
     ------
-    ServerError, StoreError
-        If the address or the database cannot be used.
+    ServerError, StoreError, PluginError
+        If the address, the database or a plug-in cannot be used.
     """
     for name in unknown_variables(os.environ):
         log.warning("an unknown setting is ignored", extra={"variable": name})
+    if settings.effect_files:
+        from twin_core.effects import load_effects
+
+        load_effects(settings.effect_files)  # what is wrong with one is said before anything starts
     listener = _listen(settings)
     database = Database(settings.database_path)
     host, port = listener.getsockname()[:2]

@@ -1,5 +1,6 @@
 """Settings: read once from ``TWIN_*`` environment variables into one frozen record."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,13 @@ class Settings(BaseSettings):
     false_alarm_rate: float = Field(
         2e-8, gt=0, le=1e-4, description="Chance that a statistic of a healthy sensor alarms at one sample."
     )
+    effects: str = Field("", description="Plug-ins with effects of your own: Python files, separated by colons.")
+    clock_tolerance_s: float = Field(
+        300.0,
+        ge=0,
+        le=1e9,
+        description="Samples further ahead of this machine's clock go into quarantine; 0: none does.",
+    )
     log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
 
     @field_validator("database_url")
@@ -66,6 +74,11 @@ class Settings(BaseSettings):
     def roles(self) -> dict[str, Role]:
         """API key -> role."""
         return parse_keys(self.api_keys.get_secret_value())
+
+    @property
+    def effect_files(self) -> tuple[Path, ...]:
+        """The plug-ins with effects."""
+        return tuple(Path(file) for file in self.effects.split(os.pathsep) if file)
 
     @property
     def database_path(self) -> Path:

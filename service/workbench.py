@@ -148,6 +148,9 @@ class Workbench(Protocol):
     def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Filter a stretch of telemetry; with a state its first sample is the one that the state already knows."""
 
+    def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant of a model in seconds, linearised where the telemetry begins."""
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples of channels in these units are no readings."""
 
@@ -158,6 +161,10 @@ class Workbench(Protocol):
         """Return temperatures and heat flows of the moment that the state describes."""
 
 
-def work(workbench: type[Workbench], function: str, task: Any, progress: Progress) -> Any:
+MakeWorkbench = Callable[[], Workbench]
+"""What makes a workbench in a worker process; it travels there."""
+
+
+def work(workbench: MakeWorkbench, function: str, task: Any, progress: Progress) -> Any:
     """Do one task; worker processes find this function by its name."""
     return getattr(workbench(), function)(task, progress)

@@ -36,6 +36,16 @@ def no_settings_from_outside() -> Iterator[None]:
     os.environ.update(kept)
 
 
+@pytest.fixture
+def plugins_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the test load plug-ins with effects; what it loaded is forgotten behind it."""
+    from twin_core.effects import REGISTRY, plugins
+
+    monkeypatch.setattr(REGISTRY, "_kinds", {name: REGISTRY[name] for name in REGISTRY})
+    monkeypatch.setattr(REGISTRY, "_sources", {})
+    monkeypatch.setattr(plugins, "_LOADED", {})
+
+
 @pytest.fixture(scope="session")
 def pair_declared() -> dict[str, Any]:
     """A specification of two nodes, not to be changed."""

@@ -68,6 +68,14 @@ def test_no_effect_that_is_gone() -> None:
     assert set(re.findall(r"^\| `([a-z_]+)` \|", DOCS["effects.md"], re.MULTILINE)) == set(REGISTRY)
 
 
+def test_the_walk_through_is_the_example() -> None:
+    source = (ROOT / "examples" / "effects" / "louver.py").read_text()
+    parts = blocks(section("effects.md", "An effect of your own"), "python")
+    assert len(parts) == 4
+    for part in parts:
+        assert part in source, part
+
+
 @pytest.mark.parametrize("path", sorted({route.path for router in ROUTERS for route in router.routes}))  # type: ignore[attr-defined]
 def test_every_route(path: str) -> None:
     written = re.sub(r"\{[a-z_]+\}", "{}", EVERYTHING)
@@ -138,7 +146,7 @@ def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
         assert main(shlex.split(line)[1:]) == 0, line
     printed = capsys.readouterr().out
     (shown,) = blocks(section("README.md", "Quick start"), "text")
-    verdict, finding = shown.strip().splitlines()
-    assert verdict in printed
+    verdict, sentence, finding = shown.strip().splitlines()
+    assert verdict in printed and sentence in printed
     assert finding.split("(")[0] in printed
     assert (tmp_path / "forecast.csv").read_text().startswith("time,T_panel_mean,")

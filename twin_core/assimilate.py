@@ -90,6 +90,38 @@ def process_noise_K2_per_s(model: CalibratedModel, network: Network, sampling_s:
     return np.where(read, np.maximum(density, mean), mean)
 
 
+def memory_s(model: CalibratedModel, record: Record) -> float:
+    """Return the longest time constant of a network in seconds: so slowly it forgets where it started.
+
+    Parameters
+    ----------
+    model
+        The model, effects included.
+    record
+        Telemetry in SI with two samples at least; the balance is linearised at the first of them, where sensors that do
+        not read and nodes without one are taken to be as warm as the others.
+
+    Returns
+    -------
+    float
+        Infinite where the network keeps a heat for ever.
+
+    Raises
+    ------
+    TelemetryError
+        If the record lacks an input that the model needs, or holds no reading.
+    """
+    network = model.network()
+    measured = _readings(model, network, record)
+    if not np.isfinite(measured).any():
+        raise TelemetryError(f"{record.name}: holds no reading of {', '.join(model.spec.sensors)}")
+    forcing = build_forcing(network, record.take(np.arange(2)), model.max_step_s)
+    start, _ = _start(network, measured, record, None)
+    steps = one_step(network, network.parameters.values, forcing, np.tile(start, (forcing.n_steps, 1)))
+    slowest = float(np.abs(np.linalg.eigvals(steps.transition[0])).max())
+    return -float(forcing.step_s[0]) / np.log(slowest) if 0.0 < slowest < 1.0 - 1e-12 else float("inf")
+
+
 def assimilate(model: CalibratedModel, record: Record, state: Json | None = None) -> Assimilation:
     """Filter a record with a calibrated model.
 

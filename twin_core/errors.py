@@ -19,6 +19,10 @@ class SpecError(TwinError):
         self.problems = tuple(problems) or (message,)
 
 
+class PluginError(TwinError):
+    """A plug-in with effects cannot be used: its file or package is named, and what to do."""
+
+
 class TelemetryError(TwinError):
     """A telemetry file, row or channel is wrong."""
 

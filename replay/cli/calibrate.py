@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.effects import effects_option
 
 
 @click.command(
@@ -31,6 +32,7 @@ from replay.cli.command import FILE, Command
     "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."
 )
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
+@effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
 def calibrate(
     spec_file: Path,

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
     from twin_core.discover import ClosedLoop
@@ -40,6 +41,7 @@ VERDICTS = {
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
+@effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def close_loop(
     spec_file: Path,
@@ -122,9 +124,11 @@ def _save(loop: "ClosedLoop", out: Path) -> None:
 def print_report(report: dict[str, Any]) -> None:
     """Print the verdict, the findings and the held-out error before and after."""
     from replay.cli.console import print_line, print_table, short
+    from twin_core.discover.phrasing import sentence
 
     print_line(f"{report['twin']}: {VERDICTS[report['verdict']]}")
     for finding in report["findings"]:
+        print_line(f"  {sentence(finding)}")
         print_line(f"  {describe(finding)}; log Bayes factor {short(finding['evidence']['log_bayes_factor'])}")
         for other in finding["alternatives"]:
             print_line(f"    cannot be told from {describe(other)}")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
     from twin_core.calibrate import CalibratedModel
@@ -36,6 +37,7 @@ _OUT = (".csv", ".json")
 )
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Forecast to write, .csv or .json.")
+@effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the forecast as JSON.")
 def forecast(
     model_file: Path,

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from replay.cli.calibrate import calibrate
+from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
 from replay.cli.forecast import forecast
@@ -37,7 +38,7 @@ def twin(traceback: bool) -> None:
     """
 
 
-for command in (demo, serve, simulate, replay, record, calibrate, forecast, close_loop):
+for command in (demo, serve, simulate, replay, record, calibrate, forecast, close_loop, check_effect):
     twin.add_command(command)
 
 

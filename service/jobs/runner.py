@@ -22,7 +22,7 @@ from service.store.database import Database
 from service.store.jobs import JobRow
 from service.store.models import Active
 from service.streams import Hub
-from service.workbench import CalibrationTask, DiagnosisTask, Telemetry, Workbench, work
+from service.workbench import CalibrationTask, DiagnosisTask, MakeWorkbench, Telemetry, work
 from twin_core import __version__
 from twin_core.telemetry import GAP_STEPS
 
@@ -56,7 +56,7 @@ class Jobs:
         database: Database,
         hub: Hub,
         metrics: Metrics,
-        workbench: type[Workbench],
+        workbench: MakeWorkbench,
         workers: int,
         deadline_s: float,
         on_model: Callable[[int], None],

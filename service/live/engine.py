@@ -10,7 +10,7 @@ from typing import ParamSpec, TypeVar
 
 from service.jobs.executor import prepare_worker
 from service.problems import Problem
-from service.workbench import Filtered, Forecasted, ForecastTask, Json, Masks, Outcome, Telemetry, Workbench
+from service.workbench import Filtered, Forecasted, ForecastTask, Json, MakeWorkbench, Masks, Outcome, Telemetry
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -26,7 +26,7 @@ class WorkerDied(Problem):
 class Engine:
     """Runs quick questions to a workbench outside of the server's process."""
 
-    def __init__(self, workbench: type[Workbench]) -> None:
+    def __init__(self, workbench: MakeWorkbench) -> None:
         """Start nothing yet: the first question starts the first process."""
         self._workbench = workbench
         self._pool: ProcessPoolExecutor | None = None
@@ -34,6 +34,10 @@ class Engine:
     async def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Filter a stretch of telemetry."""
         return await self._ask(_assimilate, self._workbench, document, telemetry, state)
+
+    async def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Return the longest time constant of a model."""
+        return await self._ask(_memory_s, self._workbench, document, telemetry)
 
     async def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples are no readings."""
@@ -78,21 +82,25 @@ def _start(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_worker)
 
 
-def _assimilate(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+def _assimilate(workbench: MakeWorkbench, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
     return workbench().assimilate(document, telemetry, state)
 
 
-def _screen(workbench: type[Workbench], units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+def _memory_s(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> float:
+    return workbench().memory_s(document, telemetry)
+
+
+def _screen(workbench: MakeWorkbench, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
     return workbench().screen(units, telemetry)
 
 
-def _forecast(workbench: type[Workbench], document: str, task: ForecastTask) -> Forecasted:
+def _forecast(workbench: MakeWorkbench, document: str, task: ForecastTask) -> Forecasted:
     return workbench().forecast(document, task)
 
 
-def _flows(workbench: type[Workbench], document: str, telemetry: Telemetry, state: Json) -> Json:
+def _flows(workbench: MakeWorkbench, document: str, telemetry: Telemetry, state: Json) -> Json:
     return workbench().flows(document, telemetry, state)
 
 
-def _inspect(workbench: type[Workbench], document: Json) -> Outcome:
+def _inspect(workbench: MakeWorkbench, document: Json) -> Outcome:
     return workbench().inspect(document)

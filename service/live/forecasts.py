@@ -1,17 +1,18 @@
 """Forecasts from the assimilated state, with planned inputs."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from service.instants import format_instant, format_instants, now_us, parse_instants
+from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.position import Position
 from service.live.tracker import Tracker
 from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Columns, ForecastRequest
-from service.store import samples
+from service.store import samples, twins
 from service.store.database import Database
 from service.store.models import Active
 from service.workbench import Forecasted, ForecastTask, Telemetry
@@ -121,17 +122,59 @@ def quantile_name(probability: float) -> str:
     return f"q{percent:02.0f}" if percent.is_integer() else f"q{percent:g}"
 
 
-def notice(tracker: Tracker) -> list[str]:
-    """Say that a sample waits to be assimilated, if one does."""
-    if tracker.waits_us is None:
-        return []
-    when = format_instant(tracker.waits_us)
-    return [
-        f"the last sample, of {when}, lies far ahead of the others and waits for another one: its clock may be wrong"
-    ]
+@dataclass(frozen=True)
+class Behind:
+    """How far a state lags: ``seconds`` of telemetry, while of ``of`` samples of the archive ``done`` are assimilated.
+
+    ``quarantined`` more lie ahead of the present.
+    """
+
+    seconds: float
+    done: int
+    of: int
+    quarantined: int
 
 
-def render(twin: Entry, active: Active, position: Position, made: Forecasted, quantiles: Sequence[float]) -> Json:
+async def behind(tracker: Tracker, database: Database) -> Behind:
+    """Return how far the state of a twin is behind the last sample; one that waits for company does not count."""
+    head = await database.read(twins.get, tracker.twin.name)
+    position, last_us = tracker.position, head.last_us
+    lag_us = 0
+    if position is not None and last_us is not None and last_us != tracker.waits_us:
+        lag_us = max(last_us - position.time_us, 0)
+    return Behind(lag_us / 1e6, max(head.samples - tracker.left, 0), head.samples, head.quarantined)
+
+
+def notices(tracker: Tracker, position: Position, lag: Behind) -> list[str]:
+    """Say where a forecast begins, if that is not the present or is known less well than it will be."""
+    told = []
+    if lag.seconds > 0.0:
+        why = tracker.trouble or f"{lag.done} of {lag.of} samples of the archive are assimilated"
+        told.append(
+            f"this forecast is not from the present: it starts at {format_instant(position.time_us)}, "
+            f"{in_words(lag.seconds)} before the last sample ({why})"
+        )
+    base = tracker.base
+    if base is not None and base.is_short:
+        needed = f"; its slowest node remembers {in_words(base.needed_s)}" if np.isfinite(base.needed_s) else ""
+        told.append(
+            f"the state rests on the last {in_words(base.known_s)} until the archive before is assimilated{needed}"
+        )
+    if tracker.waits_us is not None:
+        when = format_instant(tracker.waits_us)
+        told.append(
+            f"the last sample, of {when}, lies far ahead of the others and waits for another one: its clock may be wrong"
+        )
+    if lag.quarantined:
+        told.append(
+            f"{lag.quarantined} sample(s) ahead of the receive clock are in quarantine and take no part: its clock may be wrong"
+        )
+    return told
+
+
+def render(
+    twin: Entry, active: Active, position: Position, lag: Behind, made: Forecasted, quantiles: Sequence[float]
+) -> Json:
     """Return a forecast as clients see it."""
     values = {
         sensor: {"mean": mean.tolist()} | {quantile_name(q): made.quantiles[q][sensor].tolist() for q in quantiles}
@@ -141,6 +184,7 @@ def render(twin: Entry, active: Active, position: Position, made: Forecasted, qu
         "model_version": active.version,
         "issued": format_instant(now_us()),
         "from": format_instant(position.time_us),
+        "behind_s": lag.seconds,
         "time": format_instants(made.time_us),
         "values": values,
         "whole": {

@@ -7,7 +7,7 @@ from service.problems import Problem
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
-from service.workbench import Json, Outcome, Workbench
+from service.workbench import Json, MakeWorkbench, Outcome
 from twin_core.anomaly import Thresholds
 
 
@@ -15,7 +15,7 @@ class Live:
     """Every tracker of this service."""
 
     def __init__(
-        self, database: Database, hub: Hub, metrics: Metrics, workbench: type[Workbench], false_alarm_rate: float
+        self, database: Database, hub: Hub, metrics: Metrics, workbench: MakeWorkbench, false_alarm_rate: float
     ) -> None:
         """Start without twins."""
         self.engine = Engine(workbench)
@@ -44,15 +44,21 @@ class Live:
             )
         return tracker
 
-    def catching_up(self, twin: str) -> bool:
-        """Return whether many samples of a twin, or those before its model became active, are still to be assimilated."""
-        return any(tracker.catching_up for tracker in self._trackers.values() if tracker.twin.name == twin)
+    def find(self, twin: int) -> Tracker | None:
+        """Return the tracker of a twin, None if nothing follows its samples."""
+        return self._trackers.get(twin)
 
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""
         tracker = self._trackers.get(twin.key)
         if tracker is not None:
             tracker.arrived()
+
+    def archive_changed(self, twin: Entry) -> None:
+        """Pass on that stored samples were taken away."""
+        tracker = self._trackers.get(twin.key)
+        if tracker is not None:
+            tracker.archive_changed()
 
     def model_changed(self, twin: int) -> None:
         """Pass on that another model is active."""

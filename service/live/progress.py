@@ -24,11 +24,20 @@ Json = dict[str, Any]
 _NONE = np.empty(0, dtype=np.int64)
 
 
+class Outdated(Exception):
+    """What was assimilated is no longer in the archive."""
+
+
 @dataclass(frozen=True)
 class Step:
-    """What one step of assimilation found: ``after_us`` is the instant before it, ``after_gap`` whether that is long ago."""
+    """What one step of assimilation found: ``after_us`` is the instant before it, ``after_gap`` whether that is long ago.
+
+    ``revision`` is that of the archive that was read; ``checkpoint`` is None where the archive before was left out: nothing
+    may go on from there after a restart.
+    """
 
     version: int
+    revision: int
     after_us: int
     after_gap: bool
     time_us: NDArray[np.int64]
@@ -37,7 +46,7 @@ class Step:
     nis: NDArray[np.float64]
     told: NDArray[np.bool_]
     changes: list[Change]
-    checkpoint: Checkpoint
+    checkpoint: Checkpoint | None
 
     @property
     def span_us(self) -> tuple[int, int]:
@@ -61,6 +70,10 @@ class Reading:
         The next samples.
     told : (n_times,)
         Which of them nobody was told about yet.
+    left
+        How many samples lie beyond the position.
+    revision
+        How often samples had been taken out of the archive.
     """
 
     seq: int
@@ -68,10 +81,17 @@ class Reading:
     until_us: int | None
     fresh: Samples
     told: NDArray[np.bool_]
+    left: int
+    revision: int
 
 
 def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:
-    """Store a step; residuals of samples that arrived live get stream numbers, the others zero."""
+    """Store a step; residuals of samples that arrived live get stream numbers, the others zero.
+
+    What was said provisionally of the same time is replaced. Outdated if samples were taken away meanwhile.
+    """
+    if samples.revision(connection, twin.key) != step.revision:
+        raise Outdated(f"samples of '{twin.name}' were taken away while they were assimilated")
     n_told = int(step.told.sum())
     seq = np.zeros(step.time_us.size, dtype=np.int64)
     stretches: list[Stretch] = []
@@ -79,6 +99,8 @@ def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None,
         seq[step.told] = events.claim(connection, twin.key, n_told) + np.arange(n_told)
     columns = (np.ascontiguousarray(step.innovation_K.T), np.ascontiguousarray(step.innovation_std_K.T), step.nis)
     found = Residuals(seq, step.time_us, *columns, step.version)
+    after_us, until_us = step.span_us
+    residuals.forget(connection, twin.key, step.version, len(twin.sensors), after_us, until_us + 1)
     residuals.append(connection, twin.key, found)
     if n_told:
         stretches.append(ResidualStretch(twin.sensors, found.take(step.told)))
@@ -87,7 +109,8 @@ def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None,
     )
     rows = anomalies.apply(connection, twin.key, step.version, step.changes, step.span_us)
     stretches += _news(connection, twin, ended + rows)
-    checkpoints.put(connection, twin.key, step.version, step.checkpoint, keep_previous=step.after_gap)
+    if step.checkpoint is not None:
+        checkpoints.put(connection, twin.key, step.version, step.checkpoint, keep_previous=step.after_gap)
     return None, stretches
 
 
@@ -109,12 +132,13 @@ def end_record(
 def rewind(
     connection: sqlite3.Connection, twin: Entry, version: int, late_us: int, until_us: int | None
 ) -> Checkpoint | None:
-    """Go back to the last checkpoint before a late sample and forget what was derived from there to ``until_us``."""
+    """Go back to the last checkpoint before a late sample and forget those from there to ``until_us``.
+
+    Residuals and anomalies stay until they are replaced one by one: the sample that came late may concern few of them.
+    """
     checkpoint = checkpoints.before(connection, twin.key, version, late_us)
     after_us = -(2**62) if checkpoint is None else checkpoint.time_us
-    stop_us = 2**62 if until_us is None else until_us
-    checkpoints.forget(connection, twin.key, version, after_us, stop_us)
-    residuals.forget(connection, twin.key, version, len(twin.sensors), after_us, stop_us)
+    checkpoints.forget(connection, twin.key, version, after_us, 2**62 if until_us is None else until_us)
     return _dated(connection, twin, checkpoint)
 
 
@@ -151,6 +175,14 @@ def look(
     first = _first_in_company(connection, twin.key, np.unique(np.concatenate([*late, _NONE])), longest_gap_us)
     after_us = read[-1][1] if read else None
     known_us = None if first is None else _next_record(connection, twin.key, first, read[-1][1], longest_gap_us)
+    fresh, told, revision = ahead(connection, twin, after_us, told_seq, most, until_us)
+    return Reading(seq, first, known_us, fresh, told, samples.count_after(connection, twin.key, after_us), revision)
+
+
+def ahead(
+    connection: sqlite3.Connection, twin: Entry, after_us: int | None, told_seq: int, most: int, until_us: int | None
+) -> tuple[Samples, NDArray[np.bool_], int]:
+    """Return the next samples after an instant, which of them nobody was told about yet, and the archive's revision."""
     stop_us = samples.block_stop(connection, twin.key, after_us, most)
     if until_us is not None:
         stop_us = until_us if stop_us is None else min(stop_us, until_us)
@@ -161,7 +193,7 @@ def look(
     if fresh.time_us.size:
         span = (int(fresh.time_us[0]), int(fresh.time_us[-1]) + 1)
         told = np.isin(fresh.time_us, samples.arrived(connection, twin.key, told_seq, *span))
-    return Reading(seq, first, known_us, fresh, told)
+    return fresh, told, samples.revision(connection, twin.key)
 
 
 def outdates_inputs(

@@ -4,27 +4,24 @@ import asyncio
 import logging
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from service.instants import format_instant
-from service.live import progress, screening
+from service.live import progress
 from service.live.caution import Caution, Rest
 from service.live.engine import Engine
-from service.live.position import RECENT, Position, is_far, next_count, stretch
-from service.live.progress import Step
+from service.live.following import Followed, Following
+from service.live.position import Position, is_far, next_count
+from service.live.progress import Outdated, Reading
+from service.live.scout import Base, Scout
 from service.metrics import Metrics
 from service.problems import Problem
 from service.registry import Entry
-from service.store import models, samples
-from service.store.anomalies import Change
+from service.store import models
 from service.store.database import Database
 from service.store.gone import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
-from service.workbench import Filtered
-from twin_core.anomaly import Thresholds, detect
+from twin_core.anomaly import Thresholds
 from twin_core.errors import TwinError
 
 log = logging.getLogger("service.live")
@@ -32,6 +29,10 @@ log = logging.getLogger("service.live")
 PAUSE_S = 0.05
 """Shortest time between two steps, so that samples sent one by one are assimilated together."""
 RETRY_S = 2.0
+SHORT = 10_000
+"""If more samples are to be assimilated, a scout goes ahead, so that the present is known in seconds."""
+SCOUTED = 4
+"""Most blocks of the newest samples that are followed between two blocks of the archive."""
 _EVER = -(2**62)
 
 
@@ -63,23 +64,38 @@ class Tracker:
         """Instant of a lone sample far ahead of the others, which waits for company; None if there is none."""
         self.trouble: str | None = None
         self.catching_up = False
-        self._database, self._hub, self._engine = database, hub, engine
-        self._metrics, self._thresholds = metrics, thresholds
+        self._database, self._hub = database, hub
+        self._metrics = metrics
+        self._following = Following(twin, database, engine, thresholds)
+        self._scout: Scout | None = None
+        self._passed: Position | None = None
+        """The farthest position that a return to late samples left behind."""
+        self.left = 0
+        """About so many samples are still to be assimilated."""
         self._caution = Caution()
         self._at: Position | None = None
         self._read: list[tuple[int, int, int]] = []
         """What was read of the archive, see ``look``."""
         self._detour: _Detour | None = None
         self._rest = Rest()
-        self._told_seq, self._new_model = 0, True
+        self._told_seq, self._new_model, self._begin_anew = 0, True, False
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
         self._task = asyncio.create_task(self._run())
 
     @property
     def position(self) -> Position | None:
-        """Where the assimilation stands, or where it goes on after a detour."""
-        return self._at if self._detour is None else self._detour.back
+        """The latest known state: that of the assimilation, of a scout, or where it goes on after a detour."""
+        back = None if self._detour is None else self._detour.back
+        scouted = None if self._scout is None else self._scout.position
+        known = [p for p in (self._at, back, scouted) if p is not None]
+        return max(known, key=lambda position: position.time_us, default=None)
+
+    @property
+    def base(self) -> Base | None:
+        """How much of the past the latest state rests on; None where that is the whole archive."""
+        scout = self._scout
+        return scout.base if scout is not None and scout.position is self.position is not None else None
 
     def arrived(self) -> None:
         """Hear that samples were stored."""
@@ -91,6 +107,11 @@ class Tracker:
         self._new_model = True
         self._idle.clear()
         self._wake.set()
+
+    def archive_changed(self) -> None:
+        """Hear that stored samples were taken away: go back to before them."""
+        self._begin_anew = True
+        self.model_changed()
 
     async def settled(self, timeout_s: float) -> bool:
         """Return whether everything stored so far is assimilated, after waiting for it a while."""
@@ -126,22 +147,49 @@ class Tracker:
     async def _take_in(self) -> None:
         if self._new_model:
             await self._load()
-        while self.active is not None and await self._advance(self.active):
-            continue
+        while self.active is not None and await self._go_on(self.active):
+            if self._new_model:
+                await self._load()
+
+    async def _go_on(self, active: Active) -> bool:
+        """Assimilate the next block, and what came meanwhile; return whether there may be more."""
+        try:
+            if not await self._advance(active):
+                return False
+            if self._scout is not None:
+                await self._look_ahead(self._scout)
+        except Outdated:
+            self._new_model = self._begin_anew = True
+        return True
+
+    async def _look_ahead(self, scout: Scout) -> None:
+        """Let the scout follow what came meanwhile."""
+        self._wake.clear()
+        for _ in range(SCOUTED):
+            if self._new_model:
+                return
+            if not await scout.advance(self._told_seq):
+                break
+        else:
+            return
+        if not self._wake.is_set():
+            self._idle.set()
 
     async def _load(self) -> None:
         """Find the active model and where its assimilation stands."""
-        self._new_model = False
+        self._new_model, anew, self._begin_anew = False, self._begin_anew, False
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
             self.active, self.catching_up, self._detour = None, False, None
+            self._scout, self._passed, self.left = None, None, 0
             self._stand(None)
             return
-        if self.active is not None and self.active.version == active.version:
+        if self.active is not None and self.active.version == active.version and not anew:
             return
         checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
         self._caution, self.trouble, self.catching_up = Caution(), None, True
         self._detour, self.waits_us, self._rest = None, None, Rest()
+        self._scout, self._passed = None, None
         self._stand(None if checkpoint is None else Position.of(checkpoint))
         self.active = active
 
@@ -165,6 +213,11 @@ class Tracker:
             if before is not None and reading.late_us <= before.time_us:
                 await self._go_back(active, before, reading.late_us, reading.until_us)
             return True
+        self.left = reading.left
+        if self._scout is None and self.left > SHORT:
+            self.catching_up = True
+            self._scout = await self._send_scout(active)
+            return True
         time_us = reading.fresh.time_us
         count = next_count(time_us, active.longest_gap_us)
         if detour is None and count == time_us.size > 0 and is_far(time_us, before, active.longest_gap_us):
@@ -177,15 +230,14 @@ class Tracker:
             if reading.late_us is not None:
                 self._rest.then(self._wake.set)
             self._told_seq, self.catching_up = reading.seq, False
+            self._scout, self._passed, self.left = None, None, 0
             self._wait(int(time_us[0]) if time_us.size else None)
             return False
         self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
         try:
-            clean, seen = await self._readings(fresh, before)
-            telemetry, held = stretch(self.twin, clean, active.epoch_us, before)
-            done = await self._engine.assimilate(active.document, telemetry, None if before is None else before.state)
+            done = await self._following.filter(active, before, fresh)
         except Exception as error:  # whatever it is, it would come again with the same samples
             self.trouble = str(error) if isinstance(error, TwinError | Problem) else f"{type(error).__name__}: {error}"
             if caution.failed(fresh.time_us, reading.seq):
@@ -196,22 +248,23 @@ class Tracker:
         caution.succeeded()
         self.trouble = None
         seq = before.seq if before is not None and reading.late_us is not None else reading.seq
-        await self._keep(active, before, seen, done, held, seq, reading.told)
+        await self._keep(active, before, done, seq, reading)
         return True
 
-    async def _readings(self, fresh: Samples, before: Position | None) -> tuple[Samples, Samples]:
-        """Return a block without what the samples before it show to be no readings, and without missing ones alone."""
-        context = None
-        if before is not None:
-            n = len(self.twin.channels)
-            start_us = before.time_us - int(screening.CONTEXT * before.sampling_s * 1e6)
-            span_us = (start_us, int(fresh.time_us[0]))
-            context = await self._database.read(samples.select, self.twin.key, n, range(n), *span_us)
-        return await screening.readings(self.twin, self._engine, context, fresh)
+    async def _send_scout(self, active: Active) -> Scout:
+        """Return a scout that goes on from where the assimilation has been before, or else looks for the present."""
+        scout = Scout(self.twin, self._database, self._hub, self._following, active)
+        if self._passed is not None:
+            scout.seed(self._passed)
+        else:
+            await scout.begin()
+        return scout
 
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""
         self._rest.leave()
+        if self._passed is None or self._passed.time_us < before.time_us:
+            self._passed = before
         if self._detour is not None:
             until_us = self._detour.until_us
         arguments = (self.twin, active.version, late_us, until_us)
@@ -248,33 +301,16 @@ class Tracker:
             log.warning("a lone sample far ahead of the others waits for company", extra=extra)
         self.waits_us = instant_us
 
-    async def _keep(
-        self,
-        active: Active,
-        before: Position | None,
-        fresh: Samples,
-        done: Filtered,
-        held: dict[str, float],
-        seq: int,
-        told: NDArray[np.bool_],
-    ) -> None:
-        """Look for anomalies in an assimilated block and write everything down."""
-        time_us = fresh.time_us
-        new = slice(-time_us.size, None)
-        innovation, std, nis = done.innovation_K[new], done.innovation_std_K[new], done.nis[new]
-        before_us = _EVER if before is None else before.time_us
-        after_gap = before is not None and bool(time_us[0] - before_us > active.longest_gap_us)
-        detector = None if before is None or after_gap else before.detector
-        values = fresh.values[[self.twin.channels.index(s) for s in done.sensors]].T
-        detector, intervals = detect(detector, done.sensors, time_us, values, innovation, std, nis, self._thresholds)
-        changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
-        count = (0 if before is None else before.n_samples) + int(time_us.size)
-        recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
-        after = Position(int(time_us[-1]), seq, count, done.state, held, detector, recent_us)
-        told = told[: time_us.size] | (time_us == self.waits_us)
-        step = Step(
-            active.version, before_us, after_gap, time_us, innovation, std, nis, told, changes, after.checkpoint()
+    async def _keep(self, active: Active, before: Position | None, done: Followed, seq: int, reading: Reading) -> None:
+        """Look for anomalies in a filtered block and write everything down."""
+        time_us = done.seen.time_us
+        after_us = _EVER if before is None else before.time_us
+        scouted = None if self._scout is None else self._scout.position
+        told = (reading.told[: time_us.size] | (time_us == self.waits_us)) & (
+            time_us > (_EVER if scouted is None else scouted.time_us)
         )
+        after, step = self._following.step(active, before, after_us, done, seq, told, reading.revision)
         await self._hub.write(self.twin.key, progress.save, self.twin, step)
         self._metrics.assimilated.inc(int(time_us.size))
+        self.left = max(self.left - int(time_us.size), 0)
         self._stand(after)

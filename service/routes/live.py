@@ -46,11 +46,12 @@ async def forecast_as_is(
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
     tracker = service.live.tracker(twin)
     active, position = await forecasts.state_of(tracker)
+    lag = await forecasts.behind(tracker, service.database)
     past = await forecasts.past_of(twin, service.database, active, position)
     task = forecasts.build_task(twin, active, position, past, request)
     made = await service.live.engine.forecast(active.document, task)
-    document = forecasts.render(twin, active, position, made, request.quantiles)
-    document["notices"] += forecasts.notice(tracker)
+    document = forecasts.render(twin, active, position, lag, made, request.quantiles)
+    document["notices"] += forecasts.notices(tracker, position, lag)
     return Response(orjson.dumps(document), media_type="application/json")
 
 

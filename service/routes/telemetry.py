@@ -1,32 +1,39 @@
 """Telemetry: take samples in, give the archive out."""
 
 import asyncio
+import logging
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.routing import Route
 
+from service import archive_changes
 from service.access import Role
-from service.deps import NamedTwin, Running, Service, TwinName, reads, refuse_unknown, require
+from service.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
 from service.downsample import extremes
 from service.frames import parse_columns, parse_frames
-from service.instants import format_instant, format_instants, parse_parameter
+from service.instants import format_instant, format_instants, parse_instant, parse_parameter
 from service.problems import BadField, Problem
 from service.registry import Entry
-from service.schemas import Archive, IngestReport, Posted
-from service.store import samples
-from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE
+from service.schemas import Archive, Deletion, DeletionList, IngestReport, Interval, Posted, Quarantine
+from service.store import aside, samples
+from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Receipt, Samples
 
 PREFIX = "/v1/twins/{twin}/telemetry"
 router = APIRouter(prefix=PREFIX, tags=["telemetry"])
+quarantine = APIRouter(prefix="/v1/twins/{twin}/quarantine", tags=["telemetry"])
+log = logging.getLogger("service")
 
 NDJSON = "application/x-ndjson"
 PARSE_APART_BYTES = 512 * 1024
 """Larger bodies are parsed in a thread, so that other requests are answered meanwhile."""
 MOST_POINTS = 200_000
+MOST_SHOWN = 1000
+AHEAD = "ahead of the receive clock"
+"""Why a sample is in quarantine."""
 
 _FRAME = {"type": "string", "description": 'One {"time": ..., "values": {...}} per line.'}
 _BODY = {
@@ -71,12 +78,15 @@ def _parser(content_type: str) -> Any:
 def _report(receipt: Receipt) -> dict[str, Any]:
     counts = receipt.counts
     conflicts = receipt.conflicts if counts[CONFLICT] else []
-    return {
+    report = {
         "accepted": counts[ACCEPTED],
         "duplicates": counts[DUPLICATE],
         "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
+    if counts[QUARANTINED]:
+        report["quarantined"] = [{"index": index, "reason": AHEAD} for index in receipt.quarantined]
+    return report
 
 
 @router.get("", dependencies=[reads], response_model=Archive)
@@ -97,6 +107,82 @@ async def archive(
     )
     document = await asyncio.to_thread(_render, found, count, names, twin, max_points)
     return Response(document, media_type="application/json")
+
+
+@router.delete("", dependencies=[operates])
+async def delete(
+    service: Running,
+    twin: NamedTwin,
+    start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
+    stop: Annotated[str | None, Query(description="First instant after the last one that goes.")] = None,
+    channels: Annotated[str | None, Query(description="Channels separated by commas; absent: whole samples.")] = None,
+) -> Deletion:
+    """Delete start <= time < stop, or the values of some channels there; it can be undone for a day."""
+    if start is None and stop is None and channels is None:
+        raise Problem(422, "name at least one of start, stop and channels; to delete everything, delete the twin")
+    names = None if channels is None else _named(channels, twin)
+    made = await service.hub.write(twin.key, archive_changes.delete, twin, *span(start, stop), names)
+    if made.samples:
+        service.live.archive_changed(twin)
+    log.warning("telemetry was deleted", extra={"twin": twin.name, **made.wire()})
+    return Deletion(**made.wire())
+
+
+@router.get("/deletions", dependencies=[reads])
+async def list_deletions(service: Running, twin: NamedTwin) -> DeletionList:
+    """List what was ever deleted from the archive or the quarantine, the newest first."""
+    rows = await service.database.read(aside.deletions, twin.key)
+    return DeletionList(deletions=[Deletion(**row.wire()) for row in rows])
+
+
+@router.post("/deletions/{deletion}/undo", dependencies=[operates])
+async def undo(
+    service: Running, twin: NamedTwin, deletion: Annotated[int, Path(ge=1, le=2**62, description="Its number.")]
+) -> Deletion:
+    """Put back what a deletion took, unless it is more than a day old; what was stored there meanwhile stays as it is."""
+    made = await service.hub.write(twin.key, archive_changes.undo, twin, deletion)
+    service.live.arrived(twin)
+    log.warning("a deletion was undone", extra={"twin": twin.name, **made.wire()})
+    return Deletion(**made.wire())
+
+
+@quarantine.get("", dependencies=[reads])
+async def list_quarantine(service: Running, twin: NamedTwin) -> Quarantine:
+    """Return the samples that lie ahead of the present in the order of their arrival, the first 1000 of them."""
+    kept = await service.database.read(aside.quarantined, twin.key)
+    found = await service.database.read(aside.select, twin.key, len(twin.channels), MOST_SHOWN)
+    return Quarantine(
+        samples=kept.samples,
+        time=format_instants(found.time_us),
+        received=format_instants(found.received),
+        values={
+            name: [None if v != v else v for v in found.values[row].tolist()] for row, name in enumerate(twin.channels)
+        },
+    )
+
+
+@quarantine.post("/release", dependencies=[operates])
+async def release(service: Running, twin: NamedTwin, request: Interval | None = None) -> IngestReport:
+    """Let samples out of quarantine into the archive, where they move the present: their clock was right."""
+    asked = request or Interval()
+    start_us, stop_us = (None if t is None else parse_instant(t, n) for n, t in asked)
+    receipt = await service.hub.write(twin.key, archive_changes.release, twin, start_us, stop_us)
+    service.live.arrived(twin)
+    log.warning("samples were let out of quarantine", extra={"twin": twin.name, "n": int(receipt.status.size)})
+    return IngestReport(**_report(receipt))
+
+
+@quarantine.delete("", dependencies=[operates])
+async def discard(
+    service: Running,
+    twin: NamedTwin,
+    start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
+    stop: Annotated[str | None, Query(description="First instant after the last one that goes.")] = None,
+) -> Deletion:
+    """Delete samples in quarantine; it can be undone for a day."""
+    made = await service.database.write(aside.discard, twin.key, len(twin.channels), *span(start, stop))
+    log.warning("samples in quarantine were deleted", extra={"twin": twin.name, **made.wire()})
+    return Deletion(**made.wire())
 
 
 def span(start: str | None, stop: str | None) -> tuple[int | None, int | None]:

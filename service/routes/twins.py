@@ -6,7 +6,8 @@ from fastapi import APIRouter, Body, Response
 
 from service.deps import NamedTwin, Running, Service, operates, reads
 from service.instants import format_instant
-from service.schemas import TwinDetail, TwinInfo, TwinList
+from service.live import forecasts
+from service.schemas import Assimilation, TwinDetail, TwinInfo, TwinList
 from service.store import twins
 from service.store.twins import Twin
 from twin_core.network.spec_io import dump_spec, load_spec
@@ -26,14 +27,21 @@ def _info(twin: Twin) -> dict[str, Any]:
         "first_time": _when(twin.first_us),
         "last_time": _when(twin.last_us),
         "active_model": twin.active_version,
+        "quarantined": twin.quarantined,
         "seq": twin.seq,
         "channels": list(twin.channels),
     }
 
 
-def _detail(service: Service, twin: Twin) -> TwinDetail:
-    behind = service.live.catching_up(twin.name)
-    return TwinDetail(**_info(twin), catching_up=behind, specification=twin.specification)
+async def _detail(service: Service, twin: Twin) -> TwinDetail:
+    tracker = service.live.find(twin.key)
+    catching_up = tracker is not None and tracker.catching_up
+    progress = None
+    if tracker is not None and tracker.active is not None:
+        lag = await forecasts.behind(tracker, service.database)
+        state_us = None if tracker.position is None else tracker.position.time_us
+        progress = Assimilation(done=lag.done, of=lag.of, state_time=_when(state_us), behind_s=lag.seconds)
+    return TwinDetail(**_info(twin), catching_up=catching_up, assimilation=progress, specification=twin.specification)
 
 
 @router.post("", status_code=201, dependencies=[operates])
@@ -43,7 +51,7 @@ async def register(service: Running, response: Response, body: Annotated[dict[st
     twin, is_new = await service.register(spec.twin, dump_spec(spec))
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
-    return _detail(service, twin)
+    return await _detail(service, twin)
 
 
 @router.get("", dependencies=[reads])
@@ -55,7 +63,7 @@ async def list_twins(service: Running) -> TwinList:
 @router.get("/{twin}", dependencies=[reads])
 async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
     """Return one twin with its specification."""
-    return _detail(service, await service.database.read(twins.get, twin.name))
+    return await _detail(service, await service.database.read(twins.get, twin.name))
 
 
 @router.delete("/{twin}", status_code=204, dependencies=[operates])

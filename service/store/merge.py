@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-ACCEPTED, DUPLICATE, CONFLICT = 0, 1, 2
+ACCEPTED, DUPLICATE, CONFLICT, QUARANTINED = 0, 1, 2, 3
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,7 @@ class Merge:
     Attributes
     ----------
     status : (n_times,)
-        ACCEPTED, DUPLICATE or CONFLICT, in the order of arrival.
+        ACCEPTED, DUPLICATE or CONFLICT (QUARANTINED is decided before), in the order of arrival.
     n_instants
         How many instants are new to the archive.
     """

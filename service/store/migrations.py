@@ -156,11 +156,50 @@ def _outlines(connection: sqlite3.Connection) -> None:
         )
 
 
+def _clocks(connection: sqlite3.Connection) -> None:
+    """Add receive times (chunks of earlier releases have none), and a place for samples that are set aside.
+
+    ``head.revision`` grows whenever stored samples are taken away: what was computed from them before is outdated then.
+    """
+    _run(
+        connection,
+        """
+        ALTER TABLE chunk ADD COLUMN received BLOB;
+        ALTER TABLE head ADD COLUMN revision INTEGER NOT NULL DEFAULT 0;
+        CREATE TABLE deletion (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            at_us INTEGER NOT NULL,
+            place TEXT NOT NULL,
+            start_us INTEGER,
+            stop_us INTEGER,
+            channels TEXT,
+            samples INTEGER NOT NULL,
+            undone_us INTEGER
+        );
+        CREATE INDEX deletion_twin ON deletion (twin, id);
+        CREATE TABLE aside (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            deletion INTEGER REFERENCES deletion(id) ON DELETE CASCADE,
+            n INTEGER NOT NULL,
+            first_us INTEGER NOT NULL,
+            last_us INTEGER NOT NULL,
+            time BLOB NOT NULL,
+            received BLOB NOT NULL,
+            value BLOB NOT NULL
+        );
+        CREATE INDEX aside_twin ON aside (twin, deletion, first_us, last_us, n);
+        """,
+    )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
     ("residuals and anomalies", _residuals_and_anomalies),
     ("outlines", _outlines),
+    ("clocks", _clocks),
 )
 
 

@@ -1,7 +1,7 @@
 """Samples: append-only chunks of whole batches, never a row per sample.
 
-A chunk holds three arrays as little-endian bytes: the stream numbers and instants (n_times,) and the values
-(n_channels, n_times). Small chunks are rewritten as one from time to time; what they hold never changes.
+A chunk holds four arrays as little-endian bytes: the stream numbers, the instants and when they were received (n_times,), and
+the values (n_channels, n_times). Small chunks are rewritten as one from time to time; what they hold never changes.
 """
 
 import sqlite3
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.frames import Batch
 from service.store import outline
 from service.store.gone import TwinGone
-from service.store.merge import ACCEPTED, CONFLICT, collapse, merge
+from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
 
 SMALL = 512
 """Chunks with fewer rows than this are compacted."""
@@ -28,11 +28,15 @@ MOST_CUTS = 16
 
 @dataclass(frozen=True)
 class Receipt:
-    """What became of a batch: (n_times,) status, the number of the first stored sample, the archive's last instant."""
+    """What became of a batch: (n_times,) status, the number of the first stored sample, the archive's last instant.
+
+    ``moved`` is how many samples that were stored before had to go into quarantine because of it.
+    """
 
     status: NDArray[np.int8]
     first_seq: int
     last_us: int | None
+    moved: int = 0
 
     @property
     def stored(self) -> NDArray[np.bool_]:
@@ -42,8 +46,14 @@ class Receipt:
     @cached_property
     def counts(self) -> list[int]:
         """How many samples have each status."""
-        counts: list[int] = np.bincount(self.status, minlength=CONFLICT + 1).tolist()
+        counts: list[int] = np.bincount(self.status, minlength=QUARANTINED + 1).tolist()
         return counts
+
+    @property
+    def quarantined(self) -> list[int]:
+        """Where the samples stand that lie ahead of the present."""
+        quarantined: list[int] = np.flatnonzero(self.status == QUARANTINED).tolist()
+        return quarantined
 
     @property
     def conflicts(self) -> list[int]:
@@ -82,7 +92,7 @@ def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receip
     kept = fate.status == ACCEPTED
     if not kept.any():
         return Receipt(fate.status, row[0] + 1, row[1])
-    stored = Batch(batch.time_us[kept], batch.values[:, kept])
+    stored = batch.take(kept)
     head = _advance(connection, twin, stored, fate.n_instants, after_all=False)
     if head is None:
         raise TwinGone(f"twin {twin} is gone")
@@ -117,55 +127,73 @@ def _write(connection: sqlite3.Connection, twin: int, batch: Batch, head: tuple[
     """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
     seq, small_chunks, small_rows = head
     n = int(batch.time_us.size)
-    _insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch.time_us, batch.values)
+    insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch)
     if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
         _compact(connection, twin, values_rows=batch.values.shape[0])
 
 
-def _insert(
-    connection: sqlite3.Connection,
-    twin: int,
-    seq: NDArray[np.int64],
-    time_us: NDArray[np.int64],
-    values: NDArray[np.float64],
-) -> None:
+def insert(connection: sqlite3.Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
+    """Store a chunk as it is; the head of the archive has been moved already."""
     row = connection.execute(
-        "INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
+           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)""",
         (
             twin,
-            int(time_us.size),
-            int(time_us.min()),
-            int(time_us.max()),
+            int(batch.time_us.size),
+            int(batch.time_us.min()),
+            int(batch.time_us.max()),
             int(seq.max()),
             np.ascontiguousarray(seq, dtype="<i8").data,
-            np.ascontiguousarray(time_us, dtype="<i8").data,
-            np.ascontiguousarray(values, dtype="<f8").data,
+            np.ascontiguousarray(batch.time_us, dtype="<i8").data,
+            np.ascontiguousarray(batch.values, dtype="<f8").data,
+            None if batch.received_us is None else np.ascontiguousarray(batch.received_us, dtype="<i8").data,
         ),
     )
-    outline.put(connection, "chunk", int(row.lastrowid or 0), time_us, values)
+    outline.put(connection, "chunk", int(row.lastrowid or 0), batch.time_us, batch.values)
+
+
+def unpack(n_rows: int, time: bytes, value: bytes, received: bytes | None) -> Batch:
+    """Return what a chunk holds."""
+    arrived_us = None if received is None else np.frombuffer(received, dtype="<i8")
+    return Batch(np.frombuffer(time, dtype="<i8"), _matrix(value, n_rows), arrived_us)
+
+
+def joined(batches: Sequence[Batch], n_rows: int) -> Batch:
+    """Return batches as one, in their order."""
+    times = [np.empty(0, dtype=np.int64), *(batch.time_us for batch in batches)]
+    values = [np.empty((n_rows, 0)), *(batch.values for batch in batches)]
+    received = [np.empty(0, dtype=np.int64), *(batch.received for batch in batches)]
+    return Batch(np.concatenate(times), np.concatenate(values, axis=1), np.concatenate(received))
 
 
 def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> None:
     """Rewrite the small chunks in the order of time, cut where time makes a jump, so that none spans idle years."""
     rows = connection.execute(
-        "SELECT id, seq, time, value FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
+        "SELECT id, seq, time, value, received FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
     ).fetchall()
-    time_us = np.concatenate([np.frombuffer(row[2], dtype="<i8") for row in rows])
     seq = np.concatenate([np.frombuffer(row[1], dtype="<i8") for row in rows])
-    values = np.concatenate([_matrix(row[3], values_rows) for row in rows], axis=1)
-    steps = np.diff(time_us)
+    whole = joined([unpack(values_rows, *row[2:]) for row in rows], values_rows)
+    steps = np.diff(whole.time_us)
     if (steps < 0).any():
-        order = np.argsort(time_us, kind="stable")
-        time_us, seq, values = time_us[order], seq[order], values[:, order]
-        steps = np.diff(time_us)
+        order = np.argsort(whole.time_us, kind="stable")
+        seq, whole = seq[order], Batch(whole.time_us[order], whole.values[:, order], whole.received[order])
+        steps = np.diff(whole.time_us)
     connection.executemany("DELETE FROM chunk WHERE id = ?", [(row[0],) for row in rows])
+    time_us = whole.time_us
     cuts = np.flatnonzero(steps > max(int(time_us[-1] - time_us[0]) // MOST_CUTS, 1)) + 1
-    remaining = [0, 0]
     for first, stop in pairwise([0, *cuts.tolist(), time_us.size]):
-        _insert(connection, twin, seq[first:stop], time_us[first:stop], values[:, first:stop])
-        if stop - first < SMALL:
-            remaining = [remaining[0] + 1, remaining[1] + stop - first]
-    connection.execute("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", (*remaining, twin))
+        part = Batch(time_us[first:stop], whole.values[:, first:stop], whole.received[first:stop])
+        insert(connection, twin, seq[first:stop], part)
+    count_small(connection, twin)
+
+
+def count_small(connection: sqlite3.Connection, twin: int) -> None:
+    """Note how many small chunks there are, and how many samples they hold."""
+    connection.execute(
+        """UPDATE head SET (small_chunks, small_rows) =
+           (SELECT count(*), coalesce(sum(n), 0) FROM chunk WHERE chunk.twin = head.twin AND n < ?) WHERE twin = ?""",
+        (SMALL, twin),
+    )
 
 
 def _matrix(blob: bytes, n_rows: int) -> NDArray[np.float64]:
@@ -279,6 +307,14 @@ def latest_seq(connection: sqlite3.Connection, twin: int) -> int:
     return int(row[0])
 
 
+def revision(connection: sqlite3.Connection, twin: int) -> int:
+    """Return how often stored samples of a twin were taken away."""
+    row = connection.execute("SELECT revision FROM head WHERE twin = ?", (twin,)).fetchone()
+    if row is None:
+        raise TwinGone(f"twin {twin} is gone")
+    return int(row[0])
+
+
 def arrived(
     connection: sqlite3.Connection, twin: int, after_seq: int, start_us: int, stop_us: int
 ) -> NDArray[np.int64]:
@@ -317,3 +353,51 @@ def block_stop(connection: sqlite3.Connection, twin: int, start_us: int | None, 
         if total >= n_rows:
             return int(last_us) + 1
     return None
+
+
+def count_after(connection: sqlite3.Connection, twin: int, after_us: int | None) -> int:
+    """Return how many samples lie behind an instant; those that came in pieces count as often."""
+    after = -(2**62) if after_us is None else after_us
+    query = "SELECT coalesce(sum(n), 0) FROM chunk WHERE twin = ? AND last_us > ? AND first_us > ?"
+    count = int(connection.execute(query, (twin, after, after)).fetchone()[0])
+    query = "SELECT time FROM chunk WHERE twin = ? AND last_us > ? AND first_us <= ?"
+    for (time,) in connection.execute(query, (twin, after, after)):
+        count += int((np.frombuffer(time, dtype="<i8") > after).sum())
+    return count
+
+
+def newest(connection: sqlite3.Connection, twin: int, n_channels: int, count: int) -> Samples:
+    """Return the last ``count`` samples of the archive, or all if there are fewer."""
+    found, start_us = 0, -(2**62)
+    query = "SELECT first_us, n FROM chunk WHERE twin = ? ORDER BY last_us DESC"
+    for first_us, n in connection.execute(query, (twin,)):
+        found, start_us = found + n, first_us if found == 0 else min(start_us, first_us)
+        if found >= 2 * count:  # chunks may overlap: one that began earlier may end later
+            break
+    else:
+        start_us = -(2**62)
+    held = select(connection, twin, n_channels, range(n_channels), start_us)
+    return Samples(held.time_us[-count:], held.values[:, -count:])
+
+
+MOST_SEARCHED = 256
+"""Chunks, some millions of samples, that are searched for the last value of a channel."""
+
+
+def last_values(
+    connection: sqlite3.Connection, twin: int, n_channels: int, rows: Sequence[int], before_us: int
+) -> dict[int, float]:
+    """Return the last value before an instant of each channel whose position ``rows`` names; absent where none is found."""
+    found: dict[int, tuple[int, float]] = {}
+    query = """SELECT last_us, time, value FROM chunk WHERE twin = ? AND first_us < ?
+               ORDER BY last_us DESC LIMIT ?"""
+    for last_us, time, value in connection.execute(query, (twin, before_us, MOST_SEARCHED)):
+        if len(found) == len(rows) and last_us < min(instant for instant, _ in found.values()):
+            break
+        time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)
+        for row in rows:
+            at = np.flatnonzero((time_us < before_us) & np.isfinite(matrix[row]))
+            if at.size:
+                best = at[np.argmax(time_us[at])]
+                found[row] = max(found.get(row, (-(2**62), 0.0)), (int(time_us[best]), float(matrix[row, best])))
+    return {row: value for row, (_, value) in found.items()}

@@ -24,6 +24,7 @@ class Twin:
     first_us: int | None
     last_us: int | None
     active_version: int | None
+    quarantined: int
 
     @cached_property
     def specification(self) -> dict[str, Any]:
@@ -38,7 +39,8 @@ class Twin:
 
 _SELECT = """
     SELECT twin.id, twin.name, twin.specification, twin.created_us, head.seq, head.samples, head.first_us, head.last_us,
-           (SELECT version FROM activation WHERE activation.twin = twin.id ORDER BY id DESC LIMIT 1)
+           (SELECT version FROM activation WHERE activation.twin = twin.id ORDER BY id DESC LIMIT 1),
+           (SELECT coalesce(sum(n), 0) FROM aside WHERE aside.twin = twin.id AND deletion IS NULL)
     FROM twin JOIN head ON head.twin = twin.id
 """
 

@@ -124,9 +124,17 @@ def test_its_name_is_its_key_and_it_explains_itself(kind: type[Effect]) -> None:
     assert not set(kind.keys) & set(kind.optional_keys)
     assert "=" in kind.equation
     assert len(kind.reference) > 10
-    assert kind.words
-    for effect in null_effects(kind):
-        assert "{" not in kind.words.format(**{k: str(v) for k, v in effect.where.items()})
+
+
+@each_effect
+def test_it_has_a_sentence_of_its_own_that_names_its_whole_place(kind: type[Effect]) -> None:
+    assert kind.sentence == kind.sentence.strip().rstrip(".") and kind.sentence[0] == kind.sentence[0].lower()
+    assert [other for other in REGISTRY.values() if other.sentence == kind.sentence] == [kind]
+    for where in kind.places(every_term_network().layout):
+        sentence = kind.told(where)
+        for key in kind.keys:
+            for name in [where[key]] if isinstance(where[key], str) else where[key]:
+                assert re.search(rf"\b{re.escape(name)}\b", sentence), sentence
 
 
 @each_effect

@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from service.app import create_app
-from service.core_workbench import CoreWorkbench
 from service.settings import read_settings
 from tests.service.harness import AppClient
 
@@ -41,7 +40,7 @@ def make_client(tmp_path: Path) -> Iterator[MakeClient]:
     """Return a function that starts a service on the test's database; all are stopped at the end."""
     opened: list[AppClient] = []
 
-    def make(workbench: Any = CoreWorkbench, **settings: Any) -> AppClient:
+    def make(workbench: Any = None, **settings: Any) -> AppClient:
         url = f"sqlite:///{tmp_path / 'twin.sqlite3'}"
         client = AppClient(create_app(read_settings(**{"database_url": url, **settings}), workbench=workbench))
         opened.append(client)

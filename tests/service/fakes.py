@@ -88,6 +88,10 @@ class FakeWorkbench:
         nis = np.nansum(innovation**2, axis=1)
         return Filtered(SENSORS, innovation, np.ones_like(innovation), nis, {"last": last.tolist()})
 
+    def memory_s(self, document: str, telemetry: Telemetry) -> float:
+        """Forget within half a minute."""
+        return 30.0
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Take everything for a reading."""
         return {}

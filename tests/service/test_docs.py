@@ -27,7 +27,7 @@ def test_every_setting_is_described_with_its_default() -> None:
     assert described.keys() == fields.keys()
     for name, default in fields.items():
         text = described[name]
-        if default is None or name == "TWIN_API_KEYS":
+        if default in (None, "") or name == "TWIN_API_KEYS":
             assert text in ("unset", "empty")
         elif isinstance(default, bool):
             assert text == str(default).lower()

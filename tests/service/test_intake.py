@@ -73,8 +73,10 @@ def test_a_short_body_of_very_many_missing_values_is_refused(registered: AppClie
 
 def test_only_so_much_shares_a_commit(registered: AppClient, monkeypatch) -> None:
     sizes = []
-    append = intake._append
-    monkeypatch.setattr(intake, "_append", lambda c, t, batch: sizes.append(batch.values.size) or append(c, t, batch))
+    append = intake.take_in
+    monkeypatch.setattr(
+        intake, "take_in", lambda c, t, batch, s: sizes.append(batch.values.size) or append(c, t, batch, s)
+    )
     monkeypatch.setattr(intake, "MOST_VALUES", 30)
     bodies = [
         {"time": [100 * k + j for j in range(n)], "values": {"T_px": [290] * n}} for k, n in enumerate([4] * 9 + [20])

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from tests.analytic import laplacian
 from tests.helpers import conductive_spec, model_of, record_of
-from twin_core.assimilate import FLOOR_SHARE, START_STD_HIDDEN_K, START_STD_SENSED_K, assimilate
+from twin_core.assimilate import FLOOR_SHARE, START_STD_HIDDEN_K, START_STD_SENSED_K, assimilate, memory_s
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
@@ -267,3 +267,18 @@ def test_many_steps_are_filtered_in_pieces_with_the_same_result(monkeypatch: pyt
     np.testing.assert_allclose(pieces.innovation_K, whole.innovation_K, rtol=0, atol=1e-9)
     np.testing.assert_allclose(pieces.nis, whole.nis, rtol=1e-9)
     np.testing.assert_allclose(pieces.covariance_K2, whole.covariance_K2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("wall_W_per_K", [0.5, 20.0])
+def test_a_network_remembers_for_its_longest_time_constant(wall_W_per_K: float) -> None:
+    """The slowest mode of C dT/dt = -L T, found by NumPy from the matrices written down."""
+    data = chain_spec(boundaries={"wall": {"value_K": 280.0}})
+    data["conductors"].append({"between": ["n2", "wall"]})
+    model = model_of(load_spec(data), CAPACITY | CONDUCTANCE | {"G:n2|wall": wall_W_per_K}, **{"max_step_s": 10.0})
+    exchange = np.array([[3.0, -3.0, 0.0], [-3.0, 4.0, -1.0], [0.0, -1.0, 1.0 + wall_W_per_K]])
+    rates = np.linalg.eigvals(exchange / np.array([4.0e3, 9.0e3, 2.0e3])[:, None])
+    np.testing.assert_allclose(memory_s(model, chain_record()), 1.0 / rates.real.min(), rtol=1e-3)
+
+
+def test_an_isolated_network_remembers_for_ever() -> None:
+    assert memory_s(chain_model(), chain_record()) > 1e9

@@ -69,6 +69,7 @@ def _template() -> "Template":
         phrasing.number,
         phrasing.parameters,
         phrasing.place,
+        phrasing.sentence,
         phrasing.strength,
     ):
         environment.filters[function.__name__] = function

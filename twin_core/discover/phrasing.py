@@ -29,13 +29,29 @@ def headline(report: Mapping[str, Any]) -> str:
     findings = report.get("findings") or []
     verdict = report.get("verdict")
     if verdict == "effect_added" and findings:
-        first = f"{in_words(findings[0]['effect'])} {place(findings[0].get('where') or {})}"
         more = len(findings) - 1
-        others = f", and {more} more effect{'s' if more > 1 else ''}" if more else ""
-        return f"{first[:1].upper()}{first[1:].strip()} was missing from the model{others}."
+        others = f"; {more} more effect{'s were' if more > 1 else ' was'} found" if more else ""
+        return f"{sentence(findings[0], capital=True)}{others}."
     if verdict == "unexplained":
         return "Something is missing from the model, and no known effect explains it."
     return "The declared model suffices: the data supports no missing effect."
+
+
+def sentence(finding: Mapping[str, Any], *, capital: bool = False) -> str:
+    """Return a finding as a sentence without full stop: ``a conductor between mx and battery was missing``.
+
+    It is the effect's own; a report that carries none is told by the name of the effect and its place.
+    """
+    told = finding.get("sentence")
+    if not told:
+        told = f"{in_words(finding['effect'])} {place(finding.get('where') or {})}".strip() + " was missing"
+    return told[:1].upper() + told[1:] if capital and told.split()[0] not in _names(finding) else str(told)
+
+
+def _names(finding: Mapping[str, Any]) -> set[str]:
+    """Return the names of a finding's place."""
+    places = (finding.get("where") or {}).values()
+    return {str(name) for value in places for name in ((value,) if isinstance(value, str) else value)}
 
 
 def gain(before_K: float | None, after_K: float | None) -> str:

@@ -70,6 +70,7 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
                 {
                     "effect": own.name,
                     "where": where_json(own),
+                    "sentence": own.told(own.where),
                     "parameters": parameters_json(own, stds),
                     "equation": own.equation,
                     "evidence": evidence_json(finding.judged),

@@ -1,6 +1,7 @@
 """What an effect is: a named term that a declared network may lack, with its parameters, places and starting points.
 
-Adding one is one file with a subclass, and one line in the registry of ``twin_core.effects``. Nothing else knows its name.
+Adding one is one file with a subclass, and one line: in the registry of ``twin_core.effects``, or an entry point of a package
+of your own (``twin_core.effects.plugins``). Nothing else knows its name.
 """
 
 from abc import ABC, abstractmethod
@@ -12,7 +13,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, Json
-from twin_core.errors import ModelError
+from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import Addition, ExtraNode, Layout, declared_terms
 from twin_core.network.terms import Along, CapacityTerm, ReadingTerm, Term
 from twin_core.parameters.parameter import Parameter
@@ -220,9 +221,12 @@ class Effect(ABC):
     """Keys of ``where`` that may follow."""
     equation: ClassVar[str]
     reference: ClassVar[str]
-    words: ClassVar[str]
+    sentence: ClassVar[str]
+    """What a report says of it: ``{node}``, ``{sink}``, ``{first}`` and ``{second}`` of a pair, ... stand for its place."""
     reported_settings: ClassVar[tuple[str, ...]] = ()
     """Settings that the report lists beside the parameters where the effect has them, such as knots."""
+    plugin: ClassVar[str] = ""
+    """The file or the package that it comes from, where it is none of the effects that are always there."""
     fallback: ClassVar[bool] = False
     """True for an effect that is tried only where no named one is supported."""
 
@@ -269,6 +273,20 @@ class Effect(ABC):
         """Name and place, unique in a model: ``radiation_to_sink(px,space)``."""
         places = [p for v in self.where.values() for p in ((v,) if isinstance(v, str) else v)]
         return f"{self.name}({','.join(places)})"
+
+    @classmethod
+    def told(cls, where: Mapping[str, Any]) -> str:
+        """Return the effect at a place as a sentence without capital and full stop: ``a conductor between a and b was missing``.
+
+        Raises
+        ------
+        KeyError
+            If ``where`` lacks a key that the sentence names.
+        """
+        names = {key: value for key, value in where.items() if isinstance(value, str)}
+        if "nodes" in where:
+            names["first"], names["second"] = where["nodes"]
+        return cls.sentence.format(**names)
 
     @property
     def place(self) -> tuple[str, frozenset[tuple[str, Any]]]:
@@ -394,4 +412,42 @@ def to_json(effect: Effect) -> Json:
     """Return an effect as plain data."""
     where = {k: v if isinstance(v, str) else list(v) for k, v in effect.where.items()}
     settings = {k: list(v) if isinstance(v, tuple) else v for k, v in effect.settings.items()}
-    return {"effect": effect.name, "where": where, "settings": settings, "values": dict(effect.values)}
+    data = {"effect": effect.name, "where": where, "settings": settings, "values": dict(effect.values)}
+    return data | {"plugin": effect.plugin} if effect.plugin else data
+
+
+def read(kind: type[Effect], data: Json, field: str) -> Effect:
+    """Return an effect of a kind from plain data.
+
+    Parameters
+    ----------
+    kind
+        Which effect.
+    data
+        As ``to_json`` wrote it.
+    field
+        Where it stands, for messages.
+
+    Raises
+    ------
+    SpecError
+        Naming the part of ``field`` that is missing or wrong.
+    """
+    parts = {part: data.get(part, {}) for part in ("where", "settings", "values")}
+    for part, given in parts.items():
+        if not isinstance(given, dict):
+            raise SpecError(f"{field}.{part}: must be a mapping")
+    try:
+        require(parts["where"], kind)
+        settings = {k: tuple(v) if isinstance(v, list) else v for k, v in parts["settings"].items()}
+        effect = kind(dict(parts["where"]), {k: float(v) for k, v in parts["values"].items()}, settings)
+        lacking = [q.name for q in effect.qualities() if q.name not in effect.values]
+    except ModelError as error:
+        raise SpecError(f"{field}: {error}") from error
+    except KeyError as error:
+        raise SpecError(f"{field}.settings.{error.args[0]}: is missing") from error
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"{field}.values: must be numbers ({error})") from error
+    if lacking:
+        raise SpecError(f"{field}.values.{lacking[0]}: is missing")
+    return effect

@@ -60,7 +60,7 @@ class BoundaryLag(Effect):
     keys = ("boundary",)
     equation = "tau dr/dt = T_s - r, sink = r"
     reference = "Incropera et al., Fundamentals of Heat and Mass Transfer, 7th ed., ch. 5 (lumped capacitance)"
-    words = "follows its channel late"
+    sentence = "the temperature of {boundary} lags behind its channel"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the time constant; a lag of zero is none, one far longer than the record is a constant sink."""

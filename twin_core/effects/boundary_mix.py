@@ -42,7 +42,7 @@ class BoundaryMix(Effect):
     keys = ("boundary",)
     equation = "sink = alpha T_s + (1 - alpha) T_w"
     reference = "ECSS-E-HB-31-03A, Thermal analysis handbook (effective sink temperatures)"
-    words = "is only in part what its channel reads"
+    sentence = "the temperature of {boundary} follows its channel only in part"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the share of the channel, and the temperature of the rest, which any value stands for without it."""

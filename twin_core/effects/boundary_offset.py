@@ -36,7 +36,7 @@ class BoundaryOffset(Effect):
     keys = ("boundary",)
     equation = "sink = T_s + b"
     reference = "ECSS-E-HB-31-03A, Thermal analysis handbook (boundary conditions of test correlation)"
-    words = "is another temperature than declared, by a constant"
+    sentence = "the temperature of {boundary} is offset from its declared value"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the offset; a known constant cannot fall below absolute zero."""

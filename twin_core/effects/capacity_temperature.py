@@ -57,7 +57,7 @@ class CapacityTemperature(Effect):
     keys = ("node",)
     equation = "C -> C (1 + kappa (T - T_ref)), T_ref = mean T of the training record"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15: temperature-dependent properties"
-    words = "stores more or less heat per kelvin as it warms"
+    sentence = "the heat capacity of {node} depends on temperature"
     reported_settings = ("T_ref_K",)
 
     def qualities(self) -> tuple[Quality, ...]:

@@ -48,7 +48,7 @@ class ChannelHeatLoad(Effect):
     reference = (
         "Solar heat by pitch and instrument position in the Chandra thermal models (Aldcroft, Xija documentation)"
     )
-    words = "receives heat that follows {channel}"
+    sentence = "a heat load on {node} that depends on {channel} was missing"
     reported_settings = ("knots", "states", "across")
 
     def qualities(self) -> tuple[Quality, ...]:

@@ -15,7 +15,7 @@ class ConductanceStep(OnsetEffect):
     keys = ("nodes",)
     equation = "q_a = -q_b = f G (T_b - T_a) from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 8 (contact conductance)"
-    words = "conducts another share of its declared conductance from an instant on"
+    sentence = "the conductance between {first} and {second} changed during the record"
     amplitude = Quality("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:

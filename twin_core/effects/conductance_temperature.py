@@ -64,7 +64,7 @@ class ConductanceTemperature(Effect):
     keys = ("nodes",)
     equation = "q_a = -q_b = G max(1 + beta (T_mean - T_ref), 0) (T_b - T_a)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 8; Incropera, Heat and Mass Transfer, 2.2"
-    words = "conducts differently where it is warm"
+    sentence = "the conductance between {first} and {second} depends on temperature"
     reported_settings = ("T_ref_K",)
 
     def qualities(self) -> tuple[Quality, ...]:

@@ -34,7 +34,7 @@ class ConstantHeatLoad(Effect):
     keys = ("node",)
     equation = "q = Q"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2"
-    words = "receives a constant heat that nobody declared"
+    sentence = "a constant heat load on {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the heat."""

@@ -15,7 +15,7 @@ class EmissivityStep(OnsetEffect):
     keys = ("node", "sink")
     equation = "q = sigma f epsilon A (T_s^4 - T^4) from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 4 (thermal surface finishes)"
-    words = "radiates another share to {sink} than declared from an instant on"
+    sentence = "the emissivity of the radiator from {node} to {sink} changed during the record"
     amplitude = Quality("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:

@@ -41,7 +41,7 @@ class HeatLoadStep(OnsetEffect):
     keys = ("node",)
     equation = "q = Q from time on, to stop if it ends"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2 (dissipation by operating mode)"
-    words = "receives a heat that nobody declared from an instant on"
+    sentence = "a heat load that came on at {node} was missing"
     amplitude = Quality("Q_W", "W", null=0.0)
 
     def qualities(self) -> tuple[Quality, ...]:

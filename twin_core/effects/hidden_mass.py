@@ -20,7 +20,7 @@ class HiddenMass(Effect):
     keys = ("node",)
     equation = "C_h dT_h/dt = G_h (T - T_h), q = G_h (T_h - T)"
     reference = "Paper A, section 2: nodes beyond the sensor locations (n > p)"
-    words = "exchanges heat with a mass that nobody declared"
+    sentence = "a thermal mass behind {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return capacity and conductance; without conductance the mass is not there."""

@@ -18,7 +18,7 @@ class InputDrift(Effect):
     keys = ("channel",)
     equation = "delivered = declared max(1 + r (t - t0), 0)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 4 (degradation of absorptance)"
-    words = "delivers a share of its declared heat that changes steadily"
+    sentence = "the heat of {channel} drifted away from its declared value"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the rate of change."""

@@ -20,7 +20,7 @@ class InputGain(Effect):
     keys = ("channel",)
     equation = "delivered = g declared"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
-    words = "delivers another share of its declared heat"
+    sentence = "the declared heat of {channel} is off by a constant factor"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the gain; one is null."""

@@ -27,7 +27,7 @@ class InputPowerLaw(Effect):
     keys = ("channel",)
     equation = "delivered = declared (declared / reference)^(n - 1)"
     reference = "Joule heating of a resistive load: P ~ U^2"
-    words = "delivers heat that is not proportional to its declared value"
+    sentence = "the heat of {channel} is not proportional to its declared value"
     reported_settings = ("reference",)
 
     def qualities(self) -> tuple[Quality, ...]:

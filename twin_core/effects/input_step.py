@@ -20,7 +20,7 @@ class InputStep(OnsetEffect):
     keys = ("channel",)
     equation = "delivered = f declared from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
-    words = "delivers another share of its declared heat from an instant on"
+    sentence = "the heat of {channel} changed by a constant factor during the record"
     amplitude = Quality("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:

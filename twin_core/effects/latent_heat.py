@@ -53,7 +53,7 @@ class LatentHeat(Effect):
     keys = ("node",)
     equation = "C -> C + L g(T), g = exp(-(T - T_m)^2 / (2 w^2)) / (w sqrt(2 pi))"
     reference = "Bonacina et al., Int. J. Heat Mass Transfer 16 (1973): apparent heat capacity; stepped by its enthalpy"
-    words = "takes up latent heat around a temperature"
+    sentence = "a phase change in {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the latent heat, where it melts and over what width."""

@@ -15,7 +15,7 @@ class LeakToBoundary(Effect):
     keys = ("node", "boundary")
     equation = "q = G (T_s - T)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
-    words = "leaks heat to {boundary} in proportion to the difference"
+    sentence = "a heat leak from {node} to {boundary} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the conductance."""

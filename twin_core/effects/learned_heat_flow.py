@@ -54,7 +54,7 @@ class LearnedHeatFlow(Effect):
     optional_keys = ("boundary",)
     equation = "q = sum_k c_k x^a_k z^b_k, x = (T - T_c) / T_w or (T - T_s) / T_w, z = (T_s - T_sc) / T_sw"
     reference = "Kouw et al., CCTA 2024, section III-C"
-    words = "receives a heat that repeats with its temperature but fits no named effect"
+    sentence = "a repeatable heat flow into {node} that no named effect explains was missing"
     reported_settings = ("degree",)
     fallback = True
 

@@ -43,7 +43,7 @@ class MissingConductor(Effect):
     keys = ("nodes",)
     equation = "q_a = -q_b = G (T_b - T_a)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
-    words = "exchanges heat with the other node by a linear coupling"
+    sentence = "a conductor between {first} and {second} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the conductance."""

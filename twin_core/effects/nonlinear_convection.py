@@ -52,7 +52,7 @@ class NonlinearConvection(Effect):
     keys = ("node", "boundary")
     equation = "q = k sgn(d) |d|^p, d = T_s - T"
     reference = "Incropera et al., Fundamentals of Heat and Mass Transfer, 7th ed., ch. 9"
-    words = "loses heat to {boundary} by convection that grows faster than the difference"
+    sentence = "convection from {node} to {boundary} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return coefficient and exponent."""

@@ -50,7 +50,7 @@ class PeriodicHeatLoad(Effect):
     keys = ("node",)
     equation = "q = Q + A sin(2 pi (t - t_0) / P) + B cos(2 pi (t - t_0) / P), t_0 = first sample"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2: orbital heating"
-    words = "receives a periodic heat that nobody declared"
+    sentence = "a periodic heat load on {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return mean, both amplitudes and the period."""

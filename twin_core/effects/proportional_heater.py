@@ -51,7 +51,7 @@ class ProportionalHeater(Effect):
     keys = ("node",)
     equation = "q = min(Q, k (T_set - T)) below T_set, else 0"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
-    words = "is heated in proportion below a set-point"
+    sentence = "a proportionally controlled heater on {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return gain, set-point and power limit."""

@@ -15,7 +15,7 @@ class RadiationToSink(Effect):
     keys = ("node", "sink")
     equation = "q = sigma R (T_s^4 - T^4)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2"
-    words = "radiates to {sink}"
+    sentence = "a radiator from {node} to {sink} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the exchange area R = emissivity * area * view factor."""

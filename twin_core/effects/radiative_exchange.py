@@ -46,7 +46,7 @@ class RadiativeExchange(Effect):
     keys = ("nodes",)
     equation = "q_a = -q_b = sigma R (T_b^4 - T_a^4)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
-    words = "exchanges heat with the other node by radiation"
+    sentence = "a radiative coupling between {first} and {second} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the exchange area."""

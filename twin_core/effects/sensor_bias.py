@@ -33,7 +33,7 @@ class SensorBias(OnsetEffect):
     keys = ("sensor",)
     equation = "reading = T + b from time on"
     reference = "Gertler, Fault Detection and Diagnosis in Engineering Systems, ch. 3 (additive sensor faults)"
-    words = "reads too much or too little from an instant on"
+    sentence = "sensor {sensor} has read with an offset since an instant in the record"
     amplitude = Quality("b_K", "K", null=0.0)
 
     @property

@@ -33,7 +33,7 @@ class SensorDrift(Effect):
     keys = ("sensor",)
     equation = "reading = T + d (t - t0)"
     reference = "Gertler, Fault Detection and Diagnosis in Engineering Systems, ch. 3 (additive sensor faults)"
-    words = "drifts away from the truth"
+    sentence = "sensor {sensor} drifted"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the rate of the drift."""

@@ -41,7 +41,7 @@ class SensorLag(Effect):
     keys = ("sensor",)
     equation = "tau dr/dt = T - r"
     reference = "First-order sensor dynamics; Doebelin, Measurement Systems, 5th ed., ch. 3"
-    words = "follows its node late"
+    sentence = "sensor {sensor} lags behind the temperature of its node"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the time constant; a lag of zero is none."""

@@ -198,7 +198,7 @@ class ThermostatHeater(Effect):
     keys = ("node",)
     equation = "q = Q from T < T_on until T > T_off, else 0"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
-    words = "is heated by a thermostat"
+    sentence = "a thermostatically controlled heater on {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return power and both thresholds."""

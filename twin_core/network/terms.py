@@ -92,7 +92,8 @@ class Heat:
         The nodes that the term touches.
     heat_W : (n_points, n_local)
     d_temperature : (n_points or 1, n_local, n_local)
-        d heat_W[:, a] / d temperature of nodes[b].
+        d heat_W[:, a] / d temperature of nodes[b] at the same point. A heat that is shared out over both points of a step
+        (a relay) gives at each what the sum over both changes with the temperature there.
     d_values
         Entries whose item counts the term's ``parameters`` first, then what it ``borrows``.
     d_boundaries

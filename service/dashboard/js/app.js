@@ -134,7 +134,12 @@ function drawFacts() {
 
 function renderPlots() {
   const list = sensors(), unit = unitShown(), from = units();
-  const standing = state.detail.active_model === null ? "no model is active" : state.detail.catching_up ? "catching up" : "";
+  const { active_model, catching_up, assimilation } = state.detail;
+  const under_way = catching_up && assimilation ? `assimilating ${count(assimilation.done)} of ${count(assimilation.of)}` : "";
+  const standing = active_model === null ? "no model is active" : under_way;
+  // A sensor behaves as expected only where something was expected: until a residual exists nobody knows.
+  const has_residual = (name) => state.residuals !== null && state.residuals.residual_K[name].some((v) => v !== null);
+  const doubt = (name) => (active_model === null ? standing : has_residual(name) ? "" : under_way || "no residual yet");
   $("unit").textContent = unitName(unit);
   renderLegend(list);
   drawAnomalies($("anomalies"), state.anomalies, list, standing, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
@@ -147,7 +152,7 @@ function renderPlots() {
     renderTemperatures(list, unit, from);
     renderResiduals(list);
   }
-  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, standing });
+  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, doubt });
   $("now-note").textContent = state.ahead ? `${unitName(unit)}, expected in ${span(seconds(state.ahead.time.at(-1)) - seconds(state.ahead.from))}` : unitName(unit);
   renderNetwork(unit, from);
 }
@@ -167,6 +172,7 @@ function renderTemperatures(list, unit, from) {
   $("plot-note").textContent = [
     archive.downsampled ? `extremes of ${count(archive.samples)} samples` : `${count(archive.samples)} samples`,
     ahead ? `dashed: forecast with its 90 % band${assumed(ahead.inputs)}` : "",
+    ahead && ahead.behind_s > 0 ? `not from the present: ${span(ahead.behind_s)} behind the last sample` : "",
   ].filter(Boolean).join(" · ");
 }
 

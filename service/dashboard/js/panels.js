@@ -3,7 +3,7 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, standing }) {
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, doubt }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
   const show = (value, from) => number(toUnit(value, from, unit), 2);
   const look = (name) => (open.has(name) ? ["state bad", "anomaly"] : standing ? ["state unknown", standing] : ["state", "as expected"]);
@@ -31,11 +31,11 @@ const KINDS = {
 const QUIET = {
   "": "Every sensor behaves as its model says.",
   "no model is active": "No model is active yet to compare the sensors with.",
-  "catching up": "Catching up: the archive is still being compared with the model.",
 };
+const words = (standing) => QUIET[standing] || `None so far: ${standing} samples.`;
 
 export function drawAnomalies(list, anomalies, sensors, standing, onPick) {
-  if (!anomalies.length) return list.replaceChildren(quiet(QUIET[standing]));
+  if (!anomalies.length) return list.replaceChildren(quiet(words(standing)));
   list.replaceChildren(...anomalies.slice(0, 60).map((anomaly) => {
     const index = sensors.findIndex((s) => s.name === anomaly.sensor);
     const open = anomaly.stop === null, start = seconds(anomaly.start);

@@ -48,7 +48,7 @@ def test_many_batches_in_any_order(connection: sqlite3.Connection) -> None:
     assert seqs.tolist() == list(range(3991, 4001))
     assert replayed.time_us.tolist() == (order[-10:] * 1000).tolist()
     again = samples.append(connection, 1, Batch(found.time_us, np.stack([found.values[0] * -1, found.values[0]])))
-    assert again.counts == [0, 4000, 0]
+    assert again.counts == [0, 4000, 0, 0]
 
 
 def test_compaction_does_not_span_idle_time(connection: sqlite3.Connection) -> None:

@@ -81,10 +81,20 @@ def test_place(where: dict[str, Any], text: str) -> None:
 def test_headline_of_each_verdict() -> None:
     one = {"effect": "input_gain", "where": {"channel": "Q_Box"}}
     added = {"verdict": "effect_added", "findings": [one]}
-    assert phrasing.headline(added) == "Input gain of channel Q_Box was missing from the model."
-    assert phrasing.headline({**added, "findings": [one, one, one]}).endswith(", and 2 more effects.")
+    assert phrasing.headline(added) == "Input gain of channel Q_Box was missing."
+    told = {**one, "sentence": "a conductor between mx and battery was missing"}
+    assert phrasing.headline({**added, "findings": [told]}) == "A conductor between mx and battery was missing."
+    two, three = ({**added, "findings": [told, *more]} for more in ([one], [one, one]))
+    assert phrasing.headline(two) == "A conductor between mx and battery was missing; 1 more effect was found."
+    assert phrasing.headline(three) == "A conductor between mx and battery was missing; 2 more effects were found."
     assert "no missing effect" in phrasing.headline({"verdict": "no_effect_supported", "findings": []})
     assert "no known effect explains it" in phrasing.headline({"verdict": "unexplained", "findings": []})
+
+
+def test_a_sentence_that_begins_with_a_name_keeps_its_spelling() -> None:
+    finding = {"effect": "e", "where": {"node": "px"}, "sentence": "px radiates"}
+    assert phrasing.sentence(finding, capital=True) == "px radiates"
+    assert phrasing.sentence({**finding, "sentence": "heat into px"}, capital=True) == "Heat into px"
 
 
 def test_parameters_carry_their_units() -> None:

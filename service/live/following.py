@@ -1,0 +1,107 @@
+"""From a block of samples to what is known after it: screened, filtered, looked through for anomalies."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.live import screening
+from service.live.engine import Engine
+from service.live.position import RECENT, Position, stretch
+from service.live.progress import Step
+from service.registry import Entry
+from service.store import samples
+from service.store.anomalies import Change
+from service.store.database import Database
+from service.store.models import Active
+from service.store.samples import Samples
+from service.workbench import Filtered, Telemetry
+from twin_core.anomaly import Thresholds, detect
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A filtered block: the readings as they were seen, what the filter says, and the inputs that hold at its end."""
+
+    seen: Samples
+    filtered: Filtered
+    held: dict[str, float]
+
+
+class Following:
+    """Follows samples of one twin with a model."""
+
+    def __init__(self, twin: Entry, database: Database, engine: Engine, thresholds: Thresholds) -> None:
+        """Remember whose samples they are, and who looks at them."""
+        self._twin, self._database = twin, database
+        self._engine, self._thresholds = engine, thresholds
+
+    async def filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
+        """Filter a block from a position; TwinError or Problem if it cannot be done."""
+        clean, seen = await self._readings(fresh, before)
+        telemetry, held = stretch(self._twin, clean, active.epoch_us, before)
+        state = None if before is None else before.state
+        return Followed(seen, await self._engine.assimilate(active.document, telemetry, state), held)
+
+    async def memory_s(self, active: Active, telemetry: Telemetry) -> float:
+        """Return the longest time constant of a model where some telemetry begins."""
+        return await self._engine.memory_s(active.document, telemetry)
+
+    async def _readings(self, fresh: Samples, before: Position | None) -> tuple[Samples, Samples]:
+        """Return a block without what the samples before it show to be no readings, and without missing ones alone."""
+        context = None
+        if before is not None:
+            n = len(self._twin.channels)
+            start_us = before.time_us - int(screening.CONTEXT * before.sampling_s * 1e6)
+            span_us = (start_us, int(fresh.time_us[0]))
+            context = await self._database.read(samples.select, self._twin.key, n, range(n), *span_us)
+        return await screening.readings(self._twin, self._engine, context, fresh)
+
+    def step(
+        self,
+        active: Active,
+        before: Position | None,
+        after_us: int,
+        done: Followed,
+        seq: int,
+        told: NDArray[np.bool_],
+        revision: int,
+        *,
+        is_provisional: bool = False,
+    ) -> tuple[Position, Step]:
+        """Look for anomalies in a filtered block; return where that leaves the filter, and what is to be written down.
+
+        Parameters
+        ----------
+        active, before
+            The model and the position from which the block was filtered.
+        after_us
+            The instant behind which the block says what is true.
+        done
+            The block.
+        seq
+            The number at which the stream stood when the archive was read.
+        told : (n_times,)
+            Which samples nobody was told about yet.
+        revision
+            Of the archive when it was read.
+        is_provisional
+            Whether the archive before the block was left out, to be assimilated later.
+        """
+        time_us, filtered = done.seen.time_us, done.filtered
+        new = slice(-time_us.size, None)
+        innovation, std, nis = filtered.innovation_K[new], filtered.innovation_std_K[new], filtered.nis[new]
+        after_gap = before is not None and bool(time_us[0] - before.time_us > active.longest_gap_us)
+        detector = None if before is None or after_gap else before.detector
+        values = done.seen.values[[self._twin.channels.index(s) for s in filtered.sensors]].T
+        detector, intervals = detect(
+            detector, filtered.sensors, time_us, values, innovation, std, nis, self._thresholds
+        )
+        changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
+        count = (0 if before is None else before.n_samples) + int(time_us.size)
+        recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
+        after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, detector, recent_us)
+        checkpoint = None if is_provisional else after.checkpoint()
+        found = (time_us, innovation, std, nis, told, changes)
+        step = Step(active.version, revision, after_us, after_gap, *found, checkpoint)
+        return after, step
