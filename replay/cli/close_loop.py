@@ -39,6 +39,9 @@ VERDICTS = {
 )
 @click.option("--burn-in", type=float, help="First seconds of each hold-out file that tell its initial state.")
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
+@click.option(
+    "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."
+)
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
 @effects_option
@@ -50,6 +53,7 @@ def close_loop(
     holdout_telemetry: tuple[Path, ...],
     burn_in: float | None,
     false_alarm_rate: float,
+    deadline: float | None,
     no_masking: bool,
     out: Path,
     as_json: bool,
@@ -76,6 +80,7 @@ def close_loop(
             holdout_records=held_out or None,
             burn_in_s=burn_in,
             false_alarm_rate=false_alarm_rate,
+            deadline_s=deadline,
             progress=progress,
         )
     _save(loop, out)

@@ -1,13 +1,19 @@
 """Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
+from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.effects.base import Effect
+from twin_core.errors import ModelError
+
+T = TypeVar("T")
 
 N_VALIDATED, N_VALIDATED_FREE = 3, 8
 """Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
@@ -19,6 +25,11 @@ FORESIGHT = 0.97
 UNEXPLAINED_SHARE = 1.0
 """Misfit over noise beyond which a record without a supported effect is called unexplained."""
 
+NOT_SUPPORTED = "the evidence does not reach the odds asked for"
+NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+NO_MODEL = "the corrected model could not be computed"
+NOT_EXAMINED = "its predictions could not be examined"
+NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
 REPEATABLE_SHARE = 0.1
 """A name stands while the repeatable heat that it leaves is worth less than so much of its own evidence."""
 
@@ -31,6 +42,13 @@ class Judged:
     evidence: Evidence
     trial: Trial
     validation: Validation | None = None
+    reason: str = ""
+    """Why it was not named, in words."""
+
+    @property
+    def labels(self) -> str:
+        """Return its effects and their places: ``radiation_to_sink(px,space)``."""
+        return " with ".join(effect.label for effect in self.effects)
 
 
 @dataclass(frozen=True)
@@ -57,13 +75,43 @@ class Finding:
 
 @dataclass
 class Search:
-    """The state of a search: the model so far and how it came about; ``n_named`` candidates were tried before a fallback."""
+    """The state of a search.
+
+    Attributes
+    ----------
+    trial, base
+        The model so far, and as it was declared.
+    n_named
+        Candidates that were tried before a fallback.
+    deadline
+        On the clock of ``time.monotonic``: what is not fitted by then is left out.
+    findings, rejected
+        What is supported, and what was tried and is not.
+    failures
+        Candidates whose arithmetic failed, with the reason.
+    left_out
+        What was not looked at for want of time.
+    """
 
     trial: Trial
     base: Trial
     n_named: int = 0
+    deadline: float = NO_DEADLINE
     findings: list[Finding] = field(default_factory=list)
     rejected: list[Judged] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    def attempt(self, work: Callable[[], T], what: str) -> T | None:
+        """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``."""
+        if is_late(self.deadline):
+            self.left_out.append(what)
+            return None
+        try:
+            return attempted(work, what, self.failures)
+        except ModelError as error:
+            self.failures.append(f"{what}: {error}")
+            return None
 
     def count(self, n_looked_at: int, *, fallback: bool) -> int:
         """Return how many effects and places were tried: a fallback comes after all the named ones."""
@@ -81,26 +129,37 @@ def threshold(false_alarm_rate: float) -> float:
 def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     """Keep the best option that passes evidence and validation; False if none does."""
     judged = simplest_first(once_each(options))
-    failed: list[Judged] = []
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
+    weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
+    refused: list[Judged] = []
     for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
-        validation = validate(state.trial, best.trial)
-        own = replace(best, validation=validation)
-        if is_valid(validation):
-            if _merely_resembles(state.trial, own, needed):
-                state.rejected.append(own)  # what explains less is no better a name for this heat
-                break
-            elsewhere = [j for j in judged if _places(j) != _places(best) and j not in failed]
-            close = [j for j in elsewhere if is_close(j, best)]
+        examined = state.attempt(partial(_examined, state.trial, best, needed), best.labels)
+        own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
+        refused.append(own)
+        if own.reason == NO_LAW and resembles:
+            break  # what explains less is no better a name for this heat
+        if own.validation is not None and not own.reason:
+            refused.pop()
+            elsewhere = [
+                j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
+            ]
             state.trial = best.trial
-            state.findings.append(Finding(own, tuple(close)))
+            state.findings.append(Finding(own, tuple(j for j in elsewhere if is_close(j, best))))
+            state.rejected += refused
             return True
-        failed.append(best)
-        state.rejected.append(own)
-    state.rejected += [j for j in judged if j.evidence.log_bayes_factor <= needed]
+    state.rejected += [*refused, *weak]
     return False
+
+
+def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
+    """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law."""
+    validation = validate(simple, judged.trial)
+    if not is_valid(validation):
+        return replace(judged, validation=validation, reason=NO_FORESIGHT), False
+    resembles = _merely_resembles(simple, judged, needed)
+    return replace(judged, validation=validation, reason=NO_LAW if resembles else ""), resembles
 
 
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:

@@ -3,17 +3,20 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
+from twin_core.calibrate.containment import NO_DEADLINE, attempted
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
-from twin_core.discover.judge import UNEXPLAINED_SHARE, Search
+from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
@@ -44,6 +47,7 @@ def close_loop(
     holdout_records: Sequence[Record] | None = None,
     burn_in_s: float | None = None,
     false_alarm_rate: float = 0.01,
+    deadline_s: float | None = None,
     progress: Progress = no_progress,
 ) -> ClosedLoop:
     """Close the loop on telemetry.
@@ -62,6 +66,8 @@ def close_loop(
         First seconds of each separate hold-out record that tell its initial state and are not scored.
     false_alarm_rate
         Tolerated rate of findings on healthy records, between 0 and 1.
+    deadline_s
+        Seconds after which the search ends with the best answer so far; none by default.
     progress
         Called with the fraction done; may raise to cancel.
 
@@ -76,15 +82,41 @@ def close_loop(
     """
     if not 0.0 < false_alarm_rate < 1.0:
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
+    if deadline_s is not None and not deadline_s > 0.0:
+        raise TelemetryError(f"deadline_s: must be a positive number of seconds (got {deadline_s:g})")
     begun = time.perf_counter()
+    deadline = NO_DEADLINE if deadline_s is None else time.monotonic() + deadline_s
+    with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
+        return _close_loop(
+            spec, records, holdout, holdout_records, burn_in_s, false_alarm_rate, deadline, begun, progress
+        )
+
+
+def _close_loop(
+    spec: TwinSpec,
+    records: Sequence[Record],
+    holdout: float | None,
+    holdout_records: Sequence[Record] | None,
+    burn_in_s: float | None,
+    false_alarm_rate: float,
+    deadline: float,
+    begun: float,
+    progress: Progress,
+) -> ClosedLoop:
+    """Close the loop on checked arguments; ``begun`` is on the clock of ``time.perf_counter``."""
     records = [screened(spec, record) for record in records]
     holdout_records = [screened(spec, record) for record in holdout_records or ()]
     train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
     fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
-    found = search(base, false_alarm_rate=false_alarm_rate, progress=lambda f, m: progress(0.35 + 0.5 * f, m))
-    after = corrected(found) if found.findings else before
+    found = search(
+        base,
+        false_alarm_rate=false_alarm_rate,
+        deadline=deadline,
+        progress=lambda f, m: progress(0.35 + 0.5 * f, m),
+    )
+    after = _corrected_or(before, found) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found))
@@ -97,6 +129,16 @@ def close_loop(
     report["elapsed_s"] = time.perf_counter() - begun
     progress(1.0, "done")
     return ClosedLoop(report, after, before, plots)
+
+
+def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
+    """Return the corrected model; where its arithmetic fails the findings are given up, told, and the declared one stays."""
+    after = attempted(partial(corrected, found), "the corrected model", found.failures)
+    if after is None:
+        found.rejected += [replace(f.judged, reason=NO_MODEL) for f in found.findings]
+        found.findings, found.trial = [], found.base
+        return before
+    return after
 
 
 def corrected(found: Search) -> CalibratedModel:

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import acceptance, with_met
+from twin_core.calibrate.second_order import Calibration, acceptance, stated_guesses, with_met
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.discover.experiments import separating
 from twin_core.discover.holdout import HeldOut, Prediction
@@ -128,6 +128,41 @@ def _doubts(search: Search, scores: Sequence[Json]) -> list[str]:
     ]
 
 
+def _left_out(search: Search) -> list[str]:
+    """Return what the deadline cut off, in words."""
+    if not search.left_out:
+        return []
+    some = "; ".join(dict.fromkeys(search.left_out[:5]))
+    more = f" and {len(search.left_out) - 5} more" if len(search.left_out) > 5 else ""
+    return [f"the deadline ended the search: this is the best answer so far; not looked at: {some}{more}"]
+
+
+def unexplained_share(calibration: Calibration) -> float:
+    """Return the part of the open-loop residuals' variance over the training part that is beyond the sensors' noise."""
+    scaled = np.concatenate(calibration.residuals) / calibration.problem.noise_K
+    mean_square = float(np.nanmean(scaled**2))
+    return max(0.0, 1.0 - 1.0 / mean_square) if mean_square > 0.0 else 0.0
+
+
+def parameter_rows(search: Search, before: CalibratedModel, after: CalibratedModel) -> list[Json]:
+    """Return every declared parameter as it was declared, calibrated, and corrected with the findings in place."""
+    declared = search.base.fit.problem.network
+    guesses = stated_guesses(declared) | {p.name: p.value for p in declared.parameters.parameters if p.frozen}
+    corrected = {row["name"]: row for row in after.summary["parameters"]}
+    return [
+        {
+            "name": row["name"],
+            "unit": row["unit"],
+            "declared": guesses.get(row["name"]),
+            "calibrated": {"mean": row["mean"], "std": row["std"]},
+            "corrected": {key: corrected[row["name"]][key] for key in ("mean", "std")},
+            "identified": corrected[row["name"]]["identified"],
+        }
+        for row in before.summary["parameters"]
+        if row["name"] in corrected
+    ]
+
+
 def build_report(
     search: Search,
     before: CalibratedModel,
@@ -176,12 +211,19 @@ def build_report(
         },
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
         "not_supported": [
-            {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged)}
+            {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged), "reason": judged.reason}
             for judged in best_rejected(search)[:8]
         ],
+        "unexplained_share": {
+            "before": unexplained_share(search.base.calibration),
+            "after": unexplained_share(search.trial.calibration),
+        },
+        "parameters": parameter_rows(search, before, after),
+        "failures": list(dict.fromkeys(search.failures)),
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
+            *_left_out(search),
             *before.summary["notices"],
             *(notice for p in predictions[1] for notice in p.notices),
         ],

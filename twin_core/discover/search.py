@@ -1,12 +1,16 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
-from twin_core._typing import Progress
+import numpy as np
+
+from twin_core._typing import Progress, no_progress
+from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.lumping import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
 from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
@@ -33,7 +37,9 @@ N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
 
 
-def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Search:
+def search(
+    base: Trial, *, false_alarm_rate: float, deadline: float = NO_DEADLINE, progress: Progress = no_progress
+) -> Search:
     """Find the effects that a declared model lacks.
 
     Parameters
@@ -42,6 +48,8 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
         The declared model on the training record.
     false_alarm_rate
         Odds at which a finding on a healthy record is tolerated.
+    deadline
+        On the clock of ``time.monotonic``: what is not fitted by then is left out, and told.
     progress
         Called with the fraction done.
 
@@ -50,7 +58,7 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
     Search
         With the findings in the order in which they were made.
     """
-    state = Search(base, base)
+    state = Search(base, base, deadline=deadline)
     needed = threshold(false_alarm_rate)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
@@ -65,11 +73,14 @@ def search(base: Trial, *, false_alarm_rate: float, progress: Progress) -> Searc
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if gain_of_latent_heat(state.trial.fit) <= needed:
+    missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
+    if missing is not None and missing <= needed:
         return False
-    if _extend_by_heat(state, needed, fallback=fallback):
+    what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
+    if state.attempt(partial(_extend_by_heat, state, needed, fallback=fallback), f"{what}, by what the filter leaves"):
         return True
-    return extend_by_trajectory(state, needed, fallback=fallback)
+    second = partial(extend_by_trajectory, state, needed, fallback=fallback)
+    return bool(state.attempt(second, f"{what}, by open-loop residuals"))
 
 
 def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
@@ -104,20 +115,31 @@ def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tu
 
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
     """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
+
+    def fitted(start: Trial, option: tuple[Effect, ...], n_passes: int, *, quick: bool = False) -> Judged | None:
+        work = partial(_judge, state, start, option, n_tried, n_passes=n_passes, quick=quick)
+        return state.attempt(work, " with ".join(effect.label for effect in option))
+
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        quick = list(
-            pool.map(lambda option: _judge(state, state.trial, option, n_tried, n_passes=3, quick=True), options)
-        )
+        quick = _done(pool.map(lambda option: fitted(state.trial, option, 3, quick=True), options))
         judged = sorted(quick, key=worth)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
         here = _acts_at(judged[0]) if judged else set()
         rivals = [*quick[:N_FIRST], *(j for j in judged if _acts_at(j) == here)]  # other forms where the best one acts
         near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
-        settled = list(pool.map(lambda j: _judge(state, j.trial, j.effects, n_tried, n_passes=15), near))
+        settled = _done(pool.map(lambda j: fitted(j.trial, j.effects, 15), near))
         rest = [j for j in judged if all(j is not n for n in near)]
-        compared = pool.map(lambda j: _from_trajectories(state, j, n_tried), _forms_of_the_best(settled))
+        forms = _forms_of_the_best(settled)
+        compared = _done(
+            pool.map(lambda j: state.attempt(partial(_from_trajectories, state, j, n_tried), j.labels), forms)
+        )
         return once_each([*settled, *compared, *rest])
+
+
+def _done(options: Iterable[Judged | None]) -> list[Judged]:
+    """Return what was fitted, and is likely at all."""
+    return [j for j in options if j is not None and np.isfinite(j.evidence.log_bayes_factor)]
 
 
 def _forms_of_the_best(settled: Sequence[Judged]) -> list[Judged]:
@@ -169,10 +191,18 @@ def _drop(state: Search, place: object, needed: float) -> None:
     others = [e for e in state.trial.effects if e.place != place]
     if not others:
         return
-    without = try_effects(state.trial, others, n_passes=10)
-    worth_of_it = weigh(without, state.trial, 1).log_bayes_factor
+    found = state.attempt(partial(_without, state.trial, others), f"the model without {place}")
+    if found is None:
+        return
+    without, worth_of_it = found
     if worth_of_it > needed:
         return
     state.trial = without
     state.findings = [f.without(place, worth_of_it, without) for f in state.findings]
     state.findings = [f for f in state.findings if f.effects]
+
+
+def _without(trial: Trial, others: Sequence[Effect]) -> tuple[Trial, float]:
+    """Return the trial with only some of its effects, and the log Bayes factor of what was dropped."""
+    without = try_effects(trial, others, n_passes=10)
+    return without, weigh(without, trial, 1).log_bayes_factor

@@ -7,6 +7,7 @@ that the trajectories like less is no better a name.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from math import comb
 
 from twin_core.discover.confirm import (
@@ -19,6 +20,7 @@ from twin_core.discover.confirm import (
 )
 from twin_core.discover.judge import Judged, Search, accept, is_close, once_each
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
+from twin_core.effects.base import Effect
 
 N_REFITS = 6
 TOGETHER_MISFIT_SHARE = 3.0
@@ -30,6 +32,7 @@ MOST_TOGETHER = 2
 LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
 
+NOT_BY_BOTH = "open-loop residuals suggest it, the filter's innovations do not support it"
 N_KEPT = 4
 """Sets of effects that are extended by one more."""
 
@@ -55,7 +58,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
         sets = once_each(judged)[:N_KEPT]
         if not sets:
             break
-        state.rejected += sets
+        state.rejected += [replace(j, reason=NOT_BY_BOTH) for j in sets]
         if accept(state, _supported(state, sets if fallback else sets[:1], needed), needed):
             close = tuple(j for j in sets[1:] if is_close(j, sets[0]))
             state.findings[-1] = replace(state.findings[-1], alternatives=close)
@@ -73,16 +76,23 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
     judged = []
     for effect in refined(fit, shortlist(rankings, needed, N_REFITS)):
-        trial = try_on_trajectories(seed, (*seed.present_effects, effect))
-        if trial is not None:
-            found = trial.effects[len(state.trial.effects) :]
-            evidence = weigh_trajectories(state.trial, trial, comb(n_tried, n_together))
-            judged.append(Judged(found, evidence, trial))
-    return judged
+        work = partial(_fitted, state, seed, effect, comb(n_tried, n_together))
+        judged.append(state.attempt(work, f"{effect.label} on trajectories"))
+    return [j for j in judged if j is not None]
+
+
+def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged | None:
+    """Return one more effect on top of a trial, fitted on trajectories; None where the balance has no solution."""
+    trial = try_on_trajectories(seed, (*seed.present_effects, effect))
+    if trial is None:
+        return None
+    evidence = weigh_trajectories(state.trial, trial, n_tried)
+    return Judged(trial.effects[len(state.trial.effects) :], evidence, trial)
 
 
 def _supported(state: Search, options: Sequence[Judged], needed: float) -> list[Judged]:
     """Return the options that the innovations support as well, with their parameters fitted to these."""
     likely = [j for j in options if j.evidence.log_bayes_factor > needed]
-    settled = [replace(j, trial=resettled(state.trial, j.trial)) for j in likely]
+    trials = [state.attempt(partial(resettled, state.trial, j.trial), f"{j.labels} on trajectories") for j in likely]
+    settled = [replace(j, trial=trial) for j, trial in zip(likely, trials, strict=True) if trial is not None]
     return [j for j in settled if weigh(state.trial, j.trial, 1).log_bayes_factor > needed]

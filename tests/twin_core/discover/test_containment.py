@@ -1,0 +1,80 @@
+"""A numerical failure ends one candidate, is listed with its reason, and never the search; a deadline ends it with an answer."""
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.linalg import LinAlgError
+
+from benchmarks.network_cases import network_case
+from twin_core.calibrate.second_order import fit_network
+from twin_core.discover import close_loop
+from twin_core.discover.confirm import Trial
+from twin_core.discover.search import search
+from twin_core.errors import TelemetryError
+
+SOLVERS = ("solve", "svd", "cholesky", "pinv")
+
+
+@pytest.fixture(scope="module")
+def base() -> Trial:
+    """Return a small spacecraft whose leak nobody declared, calibrated."""
+    case = network_case("leak_to_boundary", 1, n_orbits=3, dt_s=300.0)
+    fit, calibration = fit_network(case.spec, [case.record])
+    return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+
+
+def failing(solver: Callable[..., Any], after: int, every: int) -> Callable[..., Any]:
+    """Return a solver that fails at a call, and from then on at every so many."""
+    calls = 0
+
+    def work(*arguments: Any, **options: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls >= after and (calls - after) % every == 0:
+            raise LinAlgError("injected")
+        return solver(*arguments, **options)
+
+    return work
+
+
+@pytest.mark.parametrize("after", [1, 30])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_factorisation_that_fails_ends_one_candidate(
+    base: Trial, monkeypatch: pytest.MonkeyPatch, name: str, after: int
+) -> None:
+    monkeypatch.setattr(np.linalg, name, failing(getattr(np.linalg, name), after, 40))
+    found = search(base, false_alarm_rate=0.01)
+    assert found.trial.fit is not None  # whatever failed, there is an answer
+    for failure in found.failures:
+        what, _, reason = failure.partition(": ")
+        assert what and reason
+
+
+def test_everything_may_fail(base: Trial, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("twin_core.discover.search.try_effects", failing(lambda *a, **k: None, 1, 1))
+    monkeypatch.setattr("twin_core.discover.trajectories.try_on_trajectories", failing(lambda *a, **k: None, 1, 1))
+    found = search(base, false_alarm_rate=0.01)
+    assert found.findings == [] and found.trial is base
+    assert found.failures and all(failure.endswith("injected") for failure in found.failures)
+
+
+def test_a_deadline_ends_the_search_with_the_best_so_far(base: Trial) -> None:
+    found = search(base, false_alarm_rate=0.01, deadline=time.monotonic())
+    assert found.trial is base and found.left_out
+
+
+def test_a_deadline_is_told_in_the_report() -> None:
+    case = network_case("leak_to_boundary", 1, n_orbits=3, dt_s=300.0)
+    report = close_loop(case.spec, [case.record], deadline_s=1e-3).report
+    assert report["findings"] == []
+    assert any("the deadline ended the search" in notice for notice in report["notices"])
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, -1.0, np.nan])
+def test_an_impossible_deadline_is_refused(deadline_s: float) -> None:
+    case = network_case(None, 1, n_orbits=3, dt_s=300.0)
+    with pytest.raises(TelemetryError, match="deadline_s: must be a positive number of seconds"):
+        close_loop(case.spec, [case.record], deadline_s=deadline_s)
