@@ -33,6 +33,9 @@ OPENING_SHARE = 0.1
 MOST_FOLDS = 4
 """Groups of segments that are left out in turn."""
 
+BETWEEN_SESSIONS = 0.5
+"""Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to."""
+
 CONSIDERABLE = 0.1
 """Nodes whose latent heat moves them less than this share of the most moved one say nothing about an effect."""
 
@@ -103,6 +106,16 @@ class Trial:
     def log_evidence(self) -> float:
         """Log-likelihood with what a lumped network cannot follow integrated out, less what the priors hold against it."""
         return log_likelihood_beside_lumping(self.fit) + self.fit.log_prior
+
+    @property
+    def excess(self) -> float:
+        """Part of the variance of the open-loop residuals that is beyond the sensor's noise, at the worst sensor."""
+        calibration = self.calibration
+        noise = [
+            min(m.sigma_white, n) for m, n in zip(calibration.whitener.models, calibration.problem.noise_K, strict=True)
+        ]
+        square = np.nanmean((np.concatenate(calibration.residuals) / np.maximum(noise, 1e-300)) ** 2, axis=0)
+        return float(1.0 - 1.0 / max(float(np.nanmax(square)), 1.0))
 
     @property
     def n_samples(self) -> int:
@@ -334,6 +347,8 @@ class Validation:
         Share of the latent heat's variance that the effect makes superfluous, on the node where it does so most.
     n_sessions
         Segments of the training record.
+    is_law
+        Whether no effect is an event at an instant.
     """
 
     ratio: float
@@ -342,6 +357,20 @@ class Validation:
     removed_share: float
     explained_share: float
     n_sessions: int = 1
+    is_law: bool = True
+
+    @property
+    def foresight(self) -> float:
+        """Error on what the effects were not fitted to, after over before (rms).
+
+        A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
+        them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
+        their geometric mean counts.
+        """
+        if self.n_sessions > 1 and self.is_law:
+            is_told_by_all = 1.0 - self.forward_ratio >= BETWEEN_SESSIONS * (1.0 - self.ratio)
+            return self.forward_ratio if is_told_by_all else 1.0
+        return float(np.sqrt(self.ratio * self.forward_ratio))
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
@@ -371,7 +400,8 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
-    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions)
+    is_law = all(q.instant is None for effect in rich.effects for q in effect.qualities())
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

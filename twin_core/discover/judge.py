@@ -156,7 +156,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
 def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law."""
     validation = validate(simple, judged.trial)
-    if not is_valid(validation):
+    if not validation.foresight < FORESIGHT:
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     resembles = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=NO_LAW if resembles else ""), resembles
@@ -165,11 +165,16 @@ def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, boo
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
     """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
     named = [effect for effect in judged.effects if not effect.fallback]
-    most = max(needed, REPEATABLE_SHARE * judged.evidence.log_bayes_factor)
+    most = most_left(judged.evidence.log_bayes_factor, needed)
     return bool(named) and (
         leaves_a_repeatable_heat(judged.trial, named, needed, most)
         or outdone_by_a_free_form(simple, judged.trial, named, needed, most)
     )
+
+
+def most_left(log_bayes_factor: float, needed: float) -> float:
+    """Return how much evidence a repeatable heat beside a name may have, given that of the name."""
+    return max(needed, REPEATABLE_SHARE * log_bayes_factor)
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:
@@ -189,14 +194,6 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
     close = [j for j in judged if j is judged[0] or is_close(j, judged[0])]
     rest = [j for j in judged if all(j is not c for c in close)]
     return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
-
-
-def is_valid(validation: Validation) -> bool:
-    """Return whether effects predict what they were not fitted to: blocks from the others, the end from the beginning.
-
-    One event may be seen by one of the two alone, so it is their geometric mean that must fall.
-    """
-    return bool(np.sqrt(validation.ratio * validation.forward_ratio) < FORESIGHT)
 
 
 def worth(judged: Judged) -> float:

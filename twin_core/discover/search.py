@@ -33,6 +33,9 @@ SETTLING_NATS = 40.0
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
 
+LEAST_EXCESS = 0.1
+"""Part of the variance of open-loop residuals that must be beyond the noise, at one sensor at least: else nothing is missing."""
+
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
 
@@ -73,6 +76,8 @@ def search(
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
+    if state.attempt(lambda: state.trial.excess < LEAST_EXCESS, "how well trajectories fit"):
+        return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
