@@ -8,7 +8,7 @@ export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies,
   const show = (value, from) => number(toUnit(value, from, unit), 2);
   const SIGNS = { stuck: "frozen", quantised: "repeats itself", dropout: "does not report" };
   const silent = ({ state, age_s, signs }) => (state === "stale" ? `silent${age_s === null ? "" : ` for ${span(age_s)}`}` : signs.map((kind) => SIGNS[kind]).join(", "));
-  const look = (name) => (silent(telemetry[name]) ? ["state warn", silent(telemetry[name])] : open.has(name) ? ["state bad", "anomaly"] : standing ? ["state unknown", standing] : ["state", "as expected"]);
+  const look = (name) => (silent(telemetry[name]) ? ["state warn", silent(telemetry[name])] : open.has(name) ? ["state bad", "anomaly"] : doubt(name) ? ["state unknown", doubt(name)] : ["state", "as expected"]);
   const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
   const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {
