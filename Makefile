@@ -21,11 +21,14 @@ $(BENCH): $(STAMP)
 demo: $(STAMP)
 	$(BIN)/twin demo --out demo-out
 
+# Two processes, file by file: what a file sets up is set up once, and the long ones do not come last.
+PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+
 test: $(STAMP)
-	$(BIN)/pytest
+	$(PYTEST)
 
 test-fast: $(STAMP)
-	$(BIN)/pytest -m "not slow and not e2e and not browser"
+	$(PYTEST) -m "not slow and not e2e and not browser"
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

@@ -69,6 +69,24 @@ class Assimilation(_Answer):
     behind_s: float
 
 
+class ChannelState(_Answer):
+    """When a channel was last heard of.
+
+    ``last_time`` is the time that its newest reading bears, ``age_s`` for how long nothing has arrived since by the clock of
+    the service, ``delay_s`` how old that reading was when it arrived, ``interval_s`` the usual distance of readings.
+    ``state`` is live, delayed (arrives, but long after the fact), stale (silent for more than ``stale_after_s``) or never;
+    ``signs`` are the anomalies that the readings themselves show now: stuck, quantised (they repeat) or dropout.
+    """
+
+    last_time: Instant | None
+    age_s: float | None
+    delay_s: float | None
+    interval_s: float | None
+    stale_after_s: float
+    state: Literal["live", "delayed", "stale", "never"]
+    signs: list[str] = []
+
+
 class TwinDetail(TwinInfo):
     """A registered twin with its specification; ``catching_up`` while anomalies of what is stored may yet be found.
 
@@ -77,6 +95,7 @@ class TwinDetail(TwinInfo):
 
     catching_up: bool = False
     assimilation: Assimilation | None = None
+    telemetry: dict[str, ChannelState] = {}
     specification: dict[str, Any]
 
 

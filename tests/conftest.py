@@ -2,6 +2,7 @@
 
 import copy
 import os
+from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -24,6 +25,13 @@ PAIR: dict[str, Any] = {
     "radiators": [{"node": "a", "emissivity": 0.8, "area_m2": 0.2, "sink": "space"}],
     "loads": [{"channel": "Q_a", "node": "a"}],
 }
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse two tests with one id: a run in several processes would do one of them alone, in silence."""
+    often = [name for name, count in Counter(item.nodeid for item in items).items() if count > 1]
+    if often:
+        raise pytest.UsageError(f"several tests are called {often[0]}; give each an id of its own")
 
 
 @pytest.fixture(autouse=True)

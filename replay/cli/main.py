@@ -70,6 +70,9 @@ def _explain(error: Exception) -> int:
     if isinstance(error, TwinError | ReplayError):
         also = "; ".join(getattr(error, "problems", ())[1:])
         return _say(f"{error}; also: {also}" if also else str(error), BAD_INPUT)
+    plugins = sys.modules.get("twin_core.effects.plugins")
+    if plugins is not None and (line := plugins.fault_of_a_file(error)) is not None:
+        return _say(line, BAD_INPUT)
     return _say(
         f"a fault of the program: {type(error).__name__}: {error}; run twin --traceback and report it", INTERNAL
     )

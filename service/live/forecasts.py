@@ -1,6 +1,6 @@
 """Forecasts from the assimilated state, with planned inputs."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.position import Position
+from service.live.pulse import Beat
 from service.live.tracker import Tracker
 from service.problems import BadField, Problem
 from service.registry import Entry
@@ -122,6 +123,16 @@ def quantile_name(probability: float) -> str:
     return f"q{percent:02.0f}" if percent.is_integer() else f"q{percent:g}"
 
 
+def silence_s(twin: Entry, beats: Mapping[str, Beat]) -> float | None:
+    """Return for how long no sensor has been heard of, in seconds; None while one of them is, or where nobody knows."""
+    at_us = now_us()
+    sensors = [beats[name] for name in twin.sensors]
+    silent = [s for beat in sensors if (s := beat.silent_s(at_us)) is not None]
+    if not silent or any(beat.standing(at_us) in ("live", "delayed") for beat in sensors):
+        return None
+    return min(silent)
+
+
 @dataclass(frozen=True)
 class Behind:
     """How far a state lags: ``seconds`` of telemetry, while of ``of`` samples of the archive ``done`` are assimilated.
@@ -145,9 +156,17 @@ async def behind(tracker: Tracker, database: Database) -> Behind:
     return Behind(lag_us / 1e6, max(head.samples - tracker.left, 0), head.samples, head.quarantined)
 
 
-def notices(tracker: Tracker, position: Position, lag: Behind) -> list[str]:
-    """Say where a forecast begins, if that is not the present or is known less well than it will be."""
+def notices(tracker: Tracker, position: Position, lag: Behind, silent_s: float | None) -> list[str]:
+    """Say where a forecast begins, if that is not the present or is known less well than it will be.
+
+    ``silent_s`` is for how long no sensor has been heard of; None while one is.
+    """
     told = []
+    if silent_s is not None:
+        told.append(
+            f"no telemetry has arrived for {in_words(silent_s)}: this forecast starts at the last sample, "
+            f"{format_instant(position.time_us)}"
+        )
     if lag.seconds > 0.0:
         why = tracker.trouble or f"{lag.done} of {lag.of} samples of the archive are assimilated"
         told.append(

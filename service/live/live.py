@@ -1,6 +1,10 @@
 """The live state of every twin: one tracker each, and the engine they share."""
 
+import copy
+
+from service.live import pulse as pulses
 from service.live.engine import Engine
+from service.live.pulse import Beat, Pulse
 from service.live.tracker import Tracker
 from service.metrics import Metrics
 from service.problems import Problem
@@ -22,6 +26,7 @@ class Live:
         self._database, self._hub, self._metrics = database, hub, metrics
         self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
+        self._pulses: dict[int, Pulse] = {}
 
     def add(self, twin: Entry) -> None:
         """Begin to track a twin."""
@@ -31,6 +36,7 @@ class Live:
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""
+        self._pulses.pop(twin.key, None)
         tracker = self._trackers.pop(twin.key, None)
         if tracker is not None:
             await tracker.close()
@@ -43,6 +49,13 @@ class Live:
                 409, f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted"
             )
         return tracker
+
+    async def beats(self, twin: Entry) -> dict[str, Beat]:
+        """Return when each channel was last heard of, in their order."""
+        known = copy.deepcopy(self._pulses.get(twin.key))  # readers run in threads, and requests beside each other
+        pulse = await self._database.read(pulses.brought_up, twin.key, len(twin.channels), known)
+        self._pulses[twin.key] = pulse
+        return dict(zip(twin.channels, pulse.beats(), strict=True))
 
     def find(self, twin: int) -> Tracker | None:
         """Return the tracker of a twin, None if nothing follows its samples."""

@@ -47,11 +47,12 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     tracker = service.live.tracker(twin)
     active, position = await forecasts.state_of(tracker)
     lag = await forecasts.behind(tracker, service.database)
+    silent_s = forecasts.silence_s(twin, await service.live.beats(twin))
     past = await forecasts.past_of(twin, service.database, active, position)
     task = forecasts.build_task(twin, active, position, past, request)
     made = await service.live.engine.forecast(active.document, task)
     document = forecasts.render(twin, active, position, lag, made, request.quantiles)
-    document["notices"] += forecasts.notices(tracker, position, lag)
+    document["notices"] += forecasts.notices(tracker, position, lag, silent_s)
     return Response(orjson.dumps(document), media_type="application/json")
 
 

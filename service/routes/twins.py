@@ -5,12 +5,16 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Body, Response
 
 from service.deps import NamedTwin, Running, Service, operates, reads
-from service.instants import format_instant
+from service.instants import format_instant, now_us
 from service.live import forecasts
-from service.schemas import Assimilation, TwinDetail, TwinInfo, TwinList
-from service.store import twins
+from service.registry import Entry
+from service.schemas import Assimilation, ChannelState, TwinDetail, TwinInfo, TwinList
+from service.store import anomalies, twins
 from service.store.twins import Twin
 from twin_core.network.spec_io import dump_spec, load_spec
+
+OF_READINGS = ("stuck", "quantised", "dropout")
+"""Anomalies that the readings themselves show, whatever the model says."""
 
 router = APIRouter(prefix="/v1/twins", tags=["twins"])
 
@@ -41,7 +45,32 @@ async def _detail(service: Service, twin: Twin) -> TwinDetail:
         lag = await forecasts.behind(tracker, service.database)
         state_us = None if tracker.position is None else tracker.position.time_us
         progress = Assimilation(done=lag.done, of=lag.of, state_time=_when(state_us), behind_s=lag.seconds)
-    return TwinDetail(**_info(twin), catching_up=catching_up, assimilation=progress, specification=twin.specification)
+    entry = service.registry.get(twin.name)
+    return TwinDetail(
+        **_info(twin),
+        catching_up=catching_up,
+        assimilation=progress,
+        telemetry=await _telemetry(service, entry, twin.active_version),
+        specification=twin.specification,
+    )
+
+
+async def _telemetry(service: Service, twin: Entry, version: int | None) -> dict[str, ChannelState]:
+    """Return how each channel stands."""
+    beats, at_us = await service.live.beats(twin), now_us()
+    open_kinds = await service.database.read(anomalies.open_kinds, twin.key, version)
+    return {
+        name: ChannelState(
+            last_time=_when(beat.last_us),
+            age_s=beat.silent_s(at_us),
+            delay_s=beat.delay_s,
+            interval_s=beat.interval_s,
+            stale_after_s=beat.stale_after_s,
+            state=beat.standing(at_us),
+            signs=[kind for kind in open_kinds.get(name, []) if kind in OF_READINGS],
+        )
+        for name, beat in beats.items()
+    }
 
 
 @router.post("", status_code=201, dependencies=[operates])

@@ -155,3 +155,12 @@ def open_ids(connection: sqlite3.Connection, twin: int, version: int | None) -> 
     """Return the numbers of the anomalies of one model version that last."""
     query = "SELECT id FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
     return [number for (number,) in connection.execute(query, (twin, version))]
+
+
+def open_kinds(connection: sqlite3.Connection, twin: int, version: int | None) -> dict[str, list[str]]:
+    """Return the kinds of anomalies of one model version that last, by sensor."""
+    query = "SELECT DISTINCT sensor, kind FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
+    found: dict[str, list[str]] = {}
+    for sensor, kind in connection.execute(query, (twin, version)):
+        found.setdefault(sensor, []).append(kind)
+    return found

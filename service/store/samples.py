@@ -5,7 +5,7 @@ the values (n_channels, n_times). Small chunks are rewritten as one from time to
 """
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -378,6 +378,13 @@ def newest(connection: sqlite3.Connection, twin: int, n_channels: int, count: in
         start_us = -(2**62)
     held = select(connection, twin, n_channels, range(n_channels), start_us)
     return Samples(held.time_us[-count:], held.values[:, -count:])
+
+
+def newest_first(connection: sqlite3.Connection, twin: int, n_channels: int, after_seq: int) -> Iterator[Batch]:
+    """Yield the chunks with samples that came after a stream number, those that end latest first."""
+    query = """SELECT time, value, received FROM chunk WHERE twin = ? AND last_seq > ? ORDER BY last_us DESC"""
+    for blobs in connection.execute(query, (twin, after_seq)):
+        yield unpack(n_channels, *blobs)
 
 
 MOST_SEARCHED = 256

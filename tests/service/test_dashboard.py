@@ -1,5 +1,6 @@
 """The dashboard as a person uses it: real server, real Chromium, samples arriving, clicks and keys."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,11 +26,11 @@ def page(server: Server, tmp_path: Path) -> Iterator[Browser]:
         yield browser
 
 
-def send(server: Server, first: int, count: int = 200) -> None:
+def send(server: Server, first: int, count: int = 200, twin: str = "benchsat") -> None:
     times = [60.0 * k for k in range(first, first + count)]
     jumps = [290.0 + 0.001 * k + (9.0 * (k % 2) if 150 <= k < 180 else 0.0) for k in range(first, first + count)]
     values = {"T_px": jumps, "T_tank": [15.0] * count, "Q_px": [0.5] * count}
-    server.client().ingest("benchsat", times, values)
+    server.client().ingest(twin, times, values)
 
 
 def test_a_day_at_the_console(server: Server, page: Browser) -> None:
@@ -73,6 +74,23 @@ def test_a_day_at_the_console(server: Server, page: Browser) -> None:
 
     page.click("#models tbody tr:first-child button")
     page.until("document.querySelector('#models tbody tr:first-child').innerText.includes('active')")
+    assert page.troubles == []
+
+
+def test_what_is_not_of_the_present_is_told(server: Server, page: Browser) -> None:
+    server.client().register(SPEC)
+    page.until("document.getElementById('link-text').innerText === 'waiting for telemetry'")
+    now = float(int(time.time()))
+    values = {"T_px": [290.0] * 20, "T_tank": [15.0] * 20, "Q_px": [0.5] * 20}
+    server.client().ingest("benchsat", [now - 20 + k for k in range(20)], values)
+    page.until("document.getElementById('link-text').innerText === 'live'")
+    server.client().ingest("benchsat", [now + 5 * 86_400], {"T_px": [250.0]})
+    page.until("document.getElementById('facts').innerText.includes('in quarantine 1')")
+    server.client().register({**SPEC, "twin": "recorded"})
+    send(server, 0, twin="recorded")
+    page.until("[...document.getElementById('twin').options].length === 2")
+    page.press("j")
+    page.until("document.getElementById('link-text').innerText.startsWith('arriving')")
     assert page.troubles == []
 
 

@@ -24,10 +24,11 @@ def requests() -> list[tuple[str, str, Any]]:
     found = []
     for block in re.findall(r"^```sh\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL):
         for text in re.split(r"^(?=curl)", block, flags=re.MULTILINE)[1:]:
-            path = re.search(r"http://127\.0\.0\.1:8000(\S+)", text)
+            path = re.search(r"http://127\.0\.0\.1:8000([^\s']+)", text)
             body = re.search(r"-d '(.*?)'", text, re.DOTALL)
             assert path is not None
-            method = "POST" if body or "-X POST" in text else "GET"
+            named = re.search(r"-X ([A-Z]+)", text)
+            method = named[1] if named else "POST" if body else "GET"
             found.append((method, path[1], json.loads(body[1]) if body else None))
     return found
 

@@ -70,6 +70,14 @@ def installed_effects() -> Iterator[tuple[str, str, type[Effect]]]:
             yield source, PACKAGE + package, kind
 
 
+def fault_of_a_file(error: BaseException) -> str | None:
+    """Return the line to say where an error arose in a plug-in file while it was used; None where it did not."""
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if Path(frame.filename) in _LOADED:
+            return f"{frame.filename}:{frame.lineno}: {_said(error)}; correct the plug-in"
+    return None
+
+
 def remedy(plugin: str) -> str:
     """Return what to do for the plug-in that a model file remembers."""
     if plugin.startswith(PACKAGE):

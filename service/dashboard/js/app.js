@@ -13,7 +13,7 @@ const CATCH_UP_MS = 1000;  // what is assimilated in arrears is not told one by 
 
 const state = {
   twin: null, detail: null, range_s: 86400, zoom: null, unit: null, kind: "residual", hidden: new Set(),
-  latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null,
+  latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null, link: "off",
 };
 let zoomTo = () => {};
 const temperatures = new TemperatureChart($("temperatures"), (ends) => zoomTo(ends));
@@ -119,6 +119,8 @@ async function loadPlots(path) {
 
 function render(parts) {
   drawFacts();
+  drawLink();
+  if (parts.has("detail")) renderNow();
   if (parts.has("jobs")) renderJobs();
   if (parts.has("models")) renderModels();
   if (parts.has("plots") || parts.has("anomalies") || parts.has("look")) renderPlots();
@@ -126,23 +128,48 @@ function render(parts) {
 
 function drawFacts() {
   const { samples, last_time, active_model } = state.detail;
+  const kept = state.detail.quarantined;
   const fact = (label, value) => make("span", {}, `${label} `, make("b", {}, value));
   $("facts").replaceChildren(
     fact("samples", count(samples)), fact("last", last_time ? `${clock(seconds(last_time))} UTC` : "–"),
-    fact("model", active_model === null ? "none" : `v${active_model}`));
+    fact("model", active_model === null ? "none" : `v${active_model}`), ...(kept ? [fact("in quarantine", count(kept))] : []));
+}
+
+// "Live" is said of telemetry, not of the connection: silent sensors are told, and recordings that arrive late.
+function drawLink() {
+  const heard = state.detail ? sensors().map((s) => state.detail.telemetry[s.name]) : [];
+  const silent = heard.filter((c) => c.state === "stale"), late = heard.filter((c) => c.state === "delayed");
+  const ages = (list, key) => list.map((c) => c[key]).filter((v) => v !== null);
+  let look = "live", words = "live";
+  if (state.link !== "live") [look, words] = ["off", "reconnecting"];
+  else if (!heard.some((c) => c.state !== "never")) words = "waiting for telemetry";
+  else if (silent.length === heard.length) [look, words] = ["stale", ages(silent, "age_s").length ? `no telemetry for ${span(Math.min(...ages(silent, "age_s")))}` : "no telemetry now"];
+  else if (silent.length) [look, words] = ["stale", `${silent.length} of ${heard.length} sensors silent`];
+  else if (late.length) words = `arriving ${span(Math.max(...ages(late, "delay_s")))} late`;
+  $("link").dataset.state = look;
+  $("link-text").textContent = words;
+}
+
+const underWay = () => {
+  const { catching_up, assimilation } = state.detail;
+  return catching_up && assimilation ? `assimilating ${count(assimilation.done)} of ${count(assimilation.of)}` : "";
+};
+const standing = () => (state.detail.active_model === null ? "no model is active" : underWay());
+
+function renderNow() {
+  // A sensor behaves as expected only where something was expected: until a residual exists nobody knows.
+  const has_residual = (name) => state.residuals !== null && state.residuals.residual_K[name].some((v) => v !== null);
+  const doubt = (name) => (state.detail.active_model === null ? standing() : has_residual(name) ? "" : underWay() || "no residual yet");
+  const unit = unitShown(), { latest, ahead, anomalies } = state;
+  drawNow($("now"), { sensors: sensors(), units: units(), latest, ahead: ahead && ahead.values, unit, anomalies, doubt, telemetry: state.detail.telemetry });
+  $("now-note").textContent = ahead ? `${unitName(unit)}, expected in ${span(seconds(ahead.time.at(-1)) - seconds(ahead.from))}` : unitName(unit);
 }
 
 function renderPlots() {
   const list = sensors(), unit = unitShown(), from = units();
-  const { active_model, catching_up, assimilation } = state.detail;
-  const under_way = catching_up && assimilation ? `assimilating ${count(assimilation.done)} of ${count(assimilation.of)}` : "";
-  const standing = active_model === null ? "no model is active" : under_way;
-  // A sensor behaves as expected only where something was expected: until a residual exists nobody knows.
-  const has_residual = (name) => state.residuals !== null && state.residuals.residual_K[name].some((v) => v !== null);
-  const doubt = (name) => (active_model === null ? standing : has_residual(name) ? "" : under_way || "no residual yet");
   $("unit").textContent = unitName(unit);
   renderLegend(list);
-  drawAnomalies($("anomalies"), state.anomalies, list, standing, (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
+  drawAnomalies($("anomalies"), state.anomalies, list, standing(), (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
   const open = state.anomalies.filter((a) => a.stop === null).length;
   $("anomaly-note").textContent = open ? `${open} open` : "";
   if (!state.archive || !state.detail.last_time) {
@@ -152,8 +179,7 @@ function renderPlots() {
     renderTemperatures(list, unit, from);
     renderResiduals(list);
   }
-  drawNow($("now"), { sensors: list, units: from, latest: state.latest, ahead: state.ahead && state.ahead.values, unit, anomalies: state.anomalies, doubt });
-  $("now-note").textContent = state.ahead ? `${unitName(unit)}, expected in ${span(seconds(state.ahead.time.at(-1)) - seconds(state.ahead.from))}` : unitName(unit);
+  renderNow();
   renderNetwork(unit, from);
 }
 
@@ -314,8 +340,8 @@ function select(twin) {
   residuals.clear();
   refresh("detail", "models", "jobs", "anomalies", "plots");
   follow(twin, state.stop.signal, hear, (link) => {
-    $("link").dataset.state = link;
-    $("link-text").textContent = link === "live" ? "live" : "reconnecting";
+    state.link = link;
+    drawLink();
     if (link === "live") refresh("plots", "jobs", "models", "anomalies");
   });
 }
@@ -397,3 +423,4 @@ drawKinds();
 const look = () => findTwins().catch(() => { $("link").dataset.state = "off"; $("link-text").textContent = "no answer"; });
 await look();
 setInterval(look, 4000);
+setInterval(() => { if (state.twin) refresh("detail"); }, 5000);  // silence sends no message

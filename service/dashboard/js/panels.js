@@ -3,16 +3,18 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, doubt }) {
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, doubt, telemetry }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
   const show = (value, from) => number(toUnit(value, from, unit), 2);
-  const look = (name) => (open.has(name) ? ["state bad", "anomaly"] : standing ? ["state unknown", standing] : ["state", "as expected"]);
+  const SIGNS = { stuck: "frozen", quantised: "repeats itself", dropout: "does not report" };
+  const silent = ({ state, age_s, signs }) => (state === "stale" ? `silent${age_s === null ? "" : ` for ${span(age_s)}`}` : signs.map((kind) => SIGNS[kind]).join(", "));
+  const look = (name) => (silent(telemetry[name]) ? ["state warn", silent(telemetry[name])] : open.has(name) ? ["state bad", "anomaly"] : doubt(name) ? ["state unknown", doubt(name)] : ["state", "as expected"]);
   const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
   const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {
     const { name } = sensor, from = units[name], next = ahead ? ahead[name] : null;
     return make("tr", {},
-      make("td", {}, make("span", { class: "dot", style: `background:${colour(sensor.index)};margin-right:8px` }), name),
+      make("td", {}, make("span", { class: "dot", style: `background:${colour(sensor.index)};margin-right:8px` }), name, silent(telemetry[name]) ? make("div", { class: "sub" }, silent(telemetry[name])) : ""),
       make("td", { class: "num big" }, latest[name] === undefined ? "–" : show(latest[name], from)),
       make("td", { class: "num" }, next ? show(next.mean.at(-1), from) : "–"),
       make("td", { class: "num sub" }, next ? `${show(Math.min(...next.q05), from)} … ${show(Math.max(...next.q95), from)}` : ""),

@@ -1,8 +1,6 @@
 """Effects of the user's own on the command line: checked, found by the loop, kept by the model, missed where they lack."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -59,13 +57,28 @@ def test_check_effect_for_machines(desk: Path, capsys: pytest.CaptureFixture[str
         ["serve"],
     ],
 )
-def test_a_broken_plugin_ends_a_command_in_one_line(desk: Path, argv: list[str]) -> None:
-    command = [sys.executable, "-m", "replay.cli.main", *argv, "--effects", "broken.py"]
-    done = subprocess.run(command, cwd=desk, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert done.stderr.startswith("twin: broken.py: effect louver: derivatives: ")
-    assert done.stderr.count("\n") == 1 and done.stdout == ""
-    assert "twin check-effect broken.py" in done.stderr
+def test_a_broken_plugin_ends_a_command_in_one_line(
+    desk: Path, argv: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(desk)
+    assert main([*argv, "--effects", "broken.py"]) == 2
+    printed = capsys.readouterr()
+    assert printed.err.startswith("twin: broken.py: effect louver: derivatives: ")
+    assert printed.err.count("\n") == 1 and printed.out == ""
+    assert "twin check-effect broken.py" in printed.err
+
+
+def test_a_plugin_that_fails_on_the_way_is_blamed_and_not_the_program(
+    desk: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = desk / "late.py"
+    before = '        """Yield the null effect at blade'
+    text = PLUGIN.read_text().replace(before, '        assert where["node"] != "panel", "no panel"\n' + before)
+    file.write_text(text)
+    line = 1 + text[: text.index("assert where")].count("\n")
+    command = ["close-loop", "--spec", str(desk / "spec.yaml"), "--telemetry", str(desk / "data.csv")]
+    assert main([*command, "--effects", str(file), "--out", str(desk / "late")]) == 2
+    assert capsys.readouterr().err == f"twin: {file}:{line}: AssertionError: no panel; correct the plug-in\n"
 
 
 @pytest.mark.slow

@@ -1,0 +1,120 @@
+"""Whether telemetry is live: by the clock of the service, channel by channel, through restarts and recordings."""
+
+import time
+from typing import Any
+
+import pytest
+
+from service.live.pulse import Beat
+from tests.service.conftest import SPEC
+from tests.service.fakes import FakeWorkbench
+from tests.service.harness import AppClient
+
+TWIN = "/v1/twins/benchsat"
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time of this machine, which a test may set."""
+    now = [1_800_000_000.0]
+    monkeypatch.setattr(time, "time_ns", lambda: int(now[0] * 1e9))
+    return now
+
+
+def make(make_client: Any) -> AppClient:
+    client = make_client(workbench=FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    return client
+
+
+def send(client: AppClient, times: list[float], **values: list) -> None:
+    answer = client.post(f"{TWIN}/telemetry", json={"time": times, "values": values})
+    assert answer.json()["accepted"] == len(times)
+
+
+def channels(client: AppClient) -> dict[str, dict]:
+    return client.get(TWIN).json()["telemetry"]
+
+
+def states(client: AppClient) -> dict[str, str]:
+    return {name: row["state"] for name, row in channels(client).items()}
+
+
+def test_a_channel_is_stale_after_ten_of_its_own_intervals(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    assert states(client) == {"T_px": "never", "T_tank": "never", "Q_px": "never"}
+    begin = clock[0]
+    for k in range(40):  # one channel every 10 s, the other every minute
+        clock[0] = begin + 10.0 * k + 0.5
+        send(client, [begin + 10.0 * k], T_px=[290.0], T_tank=[15.0 if k % 6 == 0 else None])
+    found = channels(client)
+    assert (found["T_px"]["interval_s"], found["T_px"]["stale_after_s"], found["T_px"]["age_s"]) == (10.0, 100.0, 0.0)
+    assert (found["T_tank"]["interval_s"], found["T_tank"]["stale_after_s"]) == (60.0, 600.0)
+    assert (found["T_px"]["delay_s"], found["Q_px"]["state"]) == (0.5, "never")
+    last = clock[0]
+    for silent_s, expected in ((99.0, ("live", "live")), (101.0, ("stale", "live")), (700.0, ("stale", "stale"))):
+        clock[0] = last + silent_s
+        found = channels(client)
+        assert (found["T_px"]["state"], found["T_tank"]["state"]) == expected
+        assert found["T_px"]["age_s"] == pytest.approx(silent_s)
+
+
+def test_a_recording_is_delayed_while_it_plays_and_stale_after_it(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    send(client, [60.0 * k for k in range(100)], T_px=[290.0] * 100)
+    assert states(client)["T_px"] == "delayed"
+    clock[0] += 601.0
+    assert states(client)["T_px"] == "stale"
+
+
+def test_a_restart_forgets_nothing_of_it(make_client, clock: list[float]) -> None:
+    first = make(make_client)
+    begin = clock[0] - 100.0
+    send(first, [begin, begin + 50.0, begin + 100.0], T_px=[290.0] * 3, T_tank=[15.0, None, None])
+    before = channels(first)
+    first.close()
+    again = make_client(workbench=FakeWorkbench)
+    assert channels(again) == before
+    again.request("DELETE", f"{TWIN}/telemetry", params={"start": begin + 60.0})
+    assert (
+        channels(again)["T_px"]["interval_s"] == 50.0
+        and channels(again)["T_px"]["last_time"] < before["T_px"]["last_time"]
+    )
+
+
+def test_a_forecast_says_that_telemetry_stopped(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    begin = clock[0] - 100.0
+    send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    fresh = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+    assert fresh["notices"] == ["held the last readings"]
+    clock[0] += 10_000.0
+    late = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+    assert any("no telemetry has arrived for 2 h 47 min" in notice for notice in late["notices"])
+
+
+def test_readings_that_repeat_are_a_sign(make_client) -> None:
+    client = make(make_client)
+    wobble = [290.0 + 0.25 * (k * 7 % 5) for k in range(200)]
+    send(
+        client,
+        [float(k) for k in range(200)],
+        T_px=wobble,
+        T_tank=[15.0 + 0.25 * (k * 3 % 7) for k in range(200)],
+        Q_px=[0.5] * 200,
+    )
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    send(client, [200.0 + k for k in range(60)], T_px=[290.0] * 60, T_tank=[None] * 60)
+    client.get(f"{TWIN}/residuals")
+    found = channels(client)
+    assert "stuck" in found["T_px"]["signs"] and "dropout" in found["T_tank"]["signs"]
+
+
+def test_where_nobody_noted_the_reception_a_channel_is_not_called_live() -> None:
+    old = Beat(5, None, 1.0)
+    assert (old.standing(6), old.silent_s(6), old.delay_s) == ("stale", None, None)
