@@ -35,6 +35,9 @@ LARGEST_STEP = 1.5
 START_SHARES = (1.0, 0.03)
 """Sizes of the latent heat that a fit starts from, as shares of a typical one."""
 
+LEAST_GAIN_NATS = 0.02
+"""A step of the parameters that promises less is not taken."""
+
 SETTLED_NATS, SETTLED_LOG_STEP = 0.2, 0.3
 """A pass that adds less than this to the log-likelihood, with steps of sizes this small, is the last."""
 
@@ -57,13 +60,15 @@ def _smoothing_pass(
     fresh = []
     for nominal in nominals:
         states, heat, _ = smoothed_states(problem, latent, nominal)
-        fresh.append(linearise(problem, values, nominal.segment, states, heat[:-1]))
+        fresh.append(linearise(problem, values, nominal.segment, states, heat[:-1], grid=nominal.grid))
     return tuple(fresh)
 
 
 def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> tuple[Nominal, ...]:
     """Linearise every segment at other parameter values about the same temperatures and heat."""
-    return tuple(linearise(problem, values, n.segment, states_of(n), n.extra_W, n.steps.stages_K) for n in nominals)
+    return tuple(
+        linearise(problem, values, n.segment, states_of(n), n.extra_W, n.steps.stages_K, n.grid) for n in nominals
+    )
 
 
 def gauss_newton_step(
@@ -201,7 +206,9 @@ def _improve(
 
     before = posterior(free, latent, nominals)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
-        step, _ = gauss_newton_step(problem, free, latent, nominals, leash)
+        step, hessian = gauss_newton_step(problem, free, latent, nominals, leash)
+        if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
+            return free, latent, tuple(nominals)
     for _ in range(5):
         trial = free + step
         values = parameters.to_values(trial)

@@ -123,10 +123,11 @@ def linearise(
     states_K: FloatArray,
     extra_W: FloatArray,
     near_K: FloatArray | None = None,
+    grid: Grid | None = None,
 ) -> Nominal:
     """Return a segment linearised about states (n_steps + 1, n_nodes) and a heat (n_steps, n_nodes) that keeps them.
 
-    ``near_K`` are stage states close by, to save iterations.
+    ``near_K`` are stage states close by, to save iterations; ``grid`` is how the steps of the segment repeat, where known.
     """
     network, forcing = problem.network, segment.forcing
     steps = one_step(network, values, forcing, states_K[:-1], extra_W, near_K=near_K)
@@ -135,7 +136,7 @@ def linearise(
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
     offset_K = reading_offsets_K(network, values, segment.record.clock_s)
     read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
-    grid = grid_of(forcing.step_s, sample_of, segment.valid)
+    grid = grid or grid_of(forcing.step_s, sample_of, segment.valid)
     return Nominal(segment, states_K[:-1], extra_W, steps, read, offset_K, sample_of, grid)
 
 

@@ -215,8 +215,9 @@ def screen_sizes(
         n_tried += len(effects)
         for found, (one, basis, residual) in zip(probes, grounds, strict=True):
             whitened, projected = _projected(one, basis, blocks)
+            size, products, along = np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
             for effect, (a, b) in zip(effects, pairwise(edges), strict=True):
-                probe = _probe(effect, whitened[:, a:b], projected[:, a:b], residual)
+                probe = _probe(effect, size[a:b], products[a:b, a:b], along[a:b])
                 found += [] if probe is None else [probe]
     return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
 
@@ -263,19 +264,22 @@ def _projected(fit: HeatFit, basis: FloatArray, blocks: Sequence[FloatArray]) ->
     return whitened, whitened - basis @ (basis.T @ whitened)
 
 
-def _probe(effect: Effect, whitened: FloatArray, projected: FloatArray, residual: FloatArray) -> Probe | None:
-    """Return the probe of one candidate; None if the data cannot tell it or its best amplitude is not physical."""
-    size = np.linalg.norm(whitened, axis=0)
+def _probe(effect: Effect, size: FloatArray, products: FloatArray, along: FloatArray) -> Probe | None:
+    """Return the probe of one candidate; None if the data cannot tell it or its best amplitude is not physical.
+
+    ``size`` (n_amplitudes,) are the norms of its whitened responses; ``products`` (n_amplitudes, n_amplitudes) and ``along``
+    (n_amplitudes,) are those of the projected ones with each other and with the residual.
+    """
     if not (size > 0).any():
         return None
-    left, singular, right = np.linalg.svd(projected / np.maximum(size, 1e-300), full_matrices=False)
-    seen = singular > np.sqrt(UNSEEN_SHARE)
+    scale = np.maximum(size, 1e-300)
+    told, directions = np.linalg.eigh(products / scale / scale[:, None])
+    seen = told > UNSEEN_SHARE
     if not seen.any():
         return None
-    along = left[:, seen].T @ residual
-    amounts = right[seen].T @ (along / singular[seen]) / np.maximum(size, 1e-300)
-    moved = effect.with_amplitudes(amounts)
-    return None if moved is None else Probe(effect, moved, 0.5 * float(along @ along))
+    gained = directions[:, seen].T @ (along / scale) / np.sqrt(told[seen])
+    moved = effect.with_amplitudes(directions[:, seen] @ (gained / np.sqrt(told[seen])) / scale)
+    return None if moved is None else Probe(effect, moved, 0.5 * float(gained @ gained))
 
 
 def joint_gain(first: FloatArray, second: FloatArray, residual: FloatArray) -> float:

@@ -26,7 +26,7 @@ N_FREE_PLACES = 2
 
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
-N_SETTLED = 4
+N_SETTLED = 3
 SETTLING_NATS = 40.0
 """Options this far behind after a few passes are not fitted further."""
 
@@ -35,6 +35,9 @@ RIVAL_NATS = 20.0
 
 LEAST_EXCESS = 0.1
 """Part of the variance of open-loop residuals that must be beyond the noise, at one sensor at least: else nothing is missing."""
+
+N_FORMS = 4
+"""Other forms where the best option acts that are fitted further."""
 
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
@@ -131,9 +134,10 @@ def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
         here = _acts_at(judged[0]) if judged else set()
-        rivals = [*quick[:N_FIRST], *(j for j in judged if _acts_at(j) == here)]  # other forms where the best one acts
+        likely = [j for j in judged if j.evidence.log_bayes_factor > best - SETTLING_NATS]
+        rivals = [*quick[:N_FIRST], *[j for j in likely if _acts_at(j) == here][:N_FORMS]]
         near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
-        settled = _done(pool.map(lambda j: fitted(j.trial, j.effects, 15), near))
+        settled = _done(pool.map(lambda j: fitted(j.trial, j.effects, 12), near))
         rest = [j for j in judged if all(j is not n for n in near)]
         forms = _forms_of_the_best(settled)
         compared = _done(
