@@ -52,6 +52,19 @@ export function drawAnomalies(list, anomalies, sensors, standing, onPick) {
   }));
 }
 
+// Alarms that last: what is wrong in words, and what an operator can say to it.
+export function drawAlarms(list, alarms, { onAcknowledge, onShelve }) {
+  list.hidden = !alarms.length;
+  list.replaceChildren(...alarms.map((alarm) => {
+    const quietly = alarm.shelved_until !== null;
+    return make("li", { class: `alarm ${quietly ? "quietly" : ""}` },
+      make("div", { class: "row" }, make("span", { class: `chip ${alarm.colour === "red" ? "bad" : "warn"}` }, `${alarm.colour}${alarm.on === "forecast" ? ", forecast" : ""}`),
+        alarm.acknowledged ? make("span", { class: "sub", title: alarm.acknowledged.note || "" }, "acknowledged") : make("button", { class: "small", onclick: () => onAcknowledge(alarm) }, "Acknowledge"),
+        make("button", { class: "small", onclick: () => onShelve(alarm), title: quietly ? `until ${alarm.shelved_until}` : "hear nothing of this limit for an hour" }, quietly ? "Unshelve" : "Shelve 1 h")),
+      make("div", { class: "message" }, `${alarm.message} · since ${clock(seconds(alarm.start))}`));
+  }));
+}
+
 const LOOK = { queued: "", running: "accent", succeeded: "good", failed: "bad", cancelled: "warn" };
 
 export function drawJobs(list, jobs, { onCancel, onReport }) {
