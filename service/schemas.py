@@ -233,8 +233,20 @@ class JobList(_Answer):
     jobs: list[Job]
 
 
+class ModelError(_Answer):
+    """The open-loop error of a model over the newest samples of the archive, the same ones for every version of a list."""
+
+    rmse_K: float
+    start: Instant
+    stop: Instant
+    samples: int
+
+
 class ModelInfo(_Answer):
-    """One version of a twin's model."""
+    """One version of a twin's model.
+
+    ``validation`` is what its maker measured, each in its own way; ``error`` compares the versions of a list.
+    """
 
     version: int
     active: bool
@@ -243,6 +255,7 @@ class ModelInfo(_Answer):
     train: dict[str, Any]
     validation: dict[str, Any]
     effects: list[dict[str, Any]]
+    error: ModelError | None = None
 
 
 class ModelDetail(ModelInfo):
@@ -343,7 +356,10 @@ class Residuals(_Answer):
 
 
 class Anomaly(_Answer):
-    """An interval in which a sensor does not behave as its model; ``stop`` is null while it lasts."""
+    """An interval in which a sensor does not behave as its model; ``stop`` is null while it lasts.
+
+    ``message`` says it in words.
+    """
 
     id: int
     sensor: str
@@ -351,10 +367,11 @@ class Anomaly(_Answer):
     stop: Instant | None
     score: float
     cause: dict[str, Any] | None
+    message: str = ""
 
 
 class AnomalyList(_Answer):
-    """Anomalies of one twin, the newest first."""
+    """Anomalies of one twin: those that last first, then the newest."""
 
     anomalies: list[Anomaly]
 

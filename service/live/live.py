@@ -6,6 +6,7 @@ from service.live import pulse as pulses
 from service.live.engine import Engine
 from service.live.limits import LimitWatch
 from service.live.pulse import Beat, Pulse
+from service.live.scores import Scores
 from service.live.tracker import Tracker
 from service.metrics import Metrics
 from service.problems import Problem
@@ -34,6 +35,7 @@ class Live:
         self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
         self._pulses: dict[int, Pulse] = {}
+        self.scores = Scores(database, self.engine)
         self._limits = LimitWatch(database, hub, self.engine, self.find, limit_horizon_s)
 
     def add(self, twin: Entry) -> None:
@@ -46,6 +48,7 @@ class Live:
         """Stop tracking a twin."""
         self._pulses.pop(twin.key, None)
         self._limits.forget(twin)
+        self.scores.forget(twin)
         tracker = self._trackers.pop(twin.key, None)
         if tracker is not None:
             await tracker.close()
@@ -97,6 +100,7 @@ class Live:
     async def close(self) -> None:
         """Stop everything."""
         await self._limits.close()
+        await self.scores.close()
         for tracker in self._trackers.values():
             await tracker.close()
         await self.engine.close()
