@@ -21,7 +21,7 @@ from service.jobs.schedule import Schedule
 from service.live.live import Live
 from service.metrics import Metrics, Observe
 from service.registry import Registry
-from service.routes import dashboard, health, jobs, live, models, streams, telemetry, twins
+from service.routes import alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.settings import Settings, read_settings
 from service.shortcut import Shortcut
 from service.store import jobs as job_table
@@ -40,6 +40,7 @@ ROUTERS = (
     jobs.diagnoses,
     models.router,
     live.router,
+    alarms.router,
     streams.router,
 )
 
@@ -53,7 +54,7 @@ async def _running(
     if interrupted:
         log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
     hub = Hub(database, metrics, settings.stream_buffer)
-    live_state = Live(database, hub, metrics, workbench, settings.false_alarm_rate)
+    live_state = Live(database, hub, metrics, workbench, settings.false_alarm_rate, settings.limit_horizon_s)
     runner = Jobs(
         database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
     )

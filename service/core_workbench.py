@@ -108,6 +108,16 @@ class CoreWorkbench:
         model = _cached_model(document)
         return memory_s(model, _record(model.spec, telemetry))
 
+    def score(self, document: str, telemetry: Telemetry) -> float | None:
+        """Roll a model out over some telemetry."""
+        from twin_core.discover.holdout import split_burn_in
+        from twin_core.telemetry import LEAST_PART, cut_at_gaps
+
+        model = _cached_model(document)
+        record, _ = _screened(model.spec, telemetry)
+        parts = cut_at_gaps([record], model.spec.driving_channels)
+        return _rmse_K(model, [split_burn_in(part, None) for part in parts if part.time_s.size >= LEAST_PART])
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Look for samples that are no readings."""
         from twin_core.quality import screen

@@ -47,6 +47,7 @@ class Service:
         self.hub.open(entry.key, twin.seq)
         if self.settings.assimilate:
             self.live.add(entry)
+        self.live.arrived(entry)  # what the archive holds and nobody has looked at
         return entry
 
     async def register(self, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:

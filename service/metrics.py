@@ -54,6 +54,12 @@ class Metrics:
         self.open_anomalies = Gauge(
             "twin_open_anomalies", "Anomalies that last still.", ("twin",), registry=self.registry
         )
+        self.open_alarms = Gauge(
+            "twin_open_alarms",
+            "Limits that are exceeded, or forecast to be.",
+            ("twin", "colour"),
+            registry=self.registry,
+        )
         self.last_sample_s = Gauge(
             "twin_last_sample_timestamp_seconds", "Unix time of the last sample.", ("twin",), registry=self.registry
         )
@@ -64,8 +70,11 @@ class Metrics:
         """Show the twins as they are now, and no longer those that are gone."""
         self.open_anomalies.clear()
         self.last_sample_s.clear()
+        self.open_alarms.clear()
         for twin in vitals:
             self.open_anomalies.labels(twin.twin).set(twin.open_anomalies)
+            self.open_alarms.labels(twin.twin, "yellow").set(twin.yellow)
+            self.open_alarms.labels(twin.twin, "red").set(twin.red)
             if twin.last_us is not None:
                 self.last_sample_s.labels(twin.twin).set(twin.last_us / 1e6)
 

@@ -233,8 +233,20 @@ class JobList(_Answer):
     jobs: list[Job]
 
 
+class ModelError(_Answer):
+    """The open-loop error of a model over the newest samples of the archive, the same ones for every version of a list."""
+
+    rmse_K: float
+    start: Instant
+    stop: Instant
+    samples: int
+
+
 class ModelInfo(_Answer):
-    """One version of a twin's model."""
+    """One version of a twin's model.
+
+    ``validation`` is what its maker measured, each in its own way; ``error`` compares the versions of a list.
+    """
 
     version: int
     active: bool
@@ -243,6 +255,7 @@ class ModelInfo(_Answer):
     train: dict[str, Any]
     validation: dict[str, Any]
     effects: list[dict[str, Any]]
+    error: ModelError | None = None
 
 
 class ModelDetail(ModelInfo):
@@ -291,7 +304,8 @@ class Forecast(_Answer):
     """Expected temperatures with quantiles ``q05`` and so on, each in its channel's unit.
 
     ``inputs`` says where the future of each input and boundary channel comes from, ``from`` at which instant the forecast
-    starts, ``behind_s`` by how many seconds of telemetry that lies before the last sample.
+    starts, ``behind_s`` by how many seconds of telemetry that lies before the last sample, ``limits`` which limits are reached
+    when: ``expected`` in every second future, ``earliest`` in 5 % and ``latest`` in 95 % of them.
     """
 
     model_version: int
@@ -303,6 +317,7 @@ class Forecast(_Answer):
     whole: Whole | None = None
     units: dict[str, str | None]
     inputs: dict[str, Literal["plan", "orbit", "repeat", "hold"]] = {}
+    limits: list[dict[str, Any]] = []
     notices: list[str] = []
 
 
@@ -341,7 +356,10 @@ class Residuals(_Answer):
 
 
 class Anomaly(_Answer):
-    """An interval in which a sensor does not behave as its model; ``stop`` is null while it lasts."""
+    """An interval in which a sensor does not behave as its model; ``stop`` is null while it lasts.
+
+    ``message`` says it in words.
+    """
 
     id: int
     sensor: str
@@ -349,17 +367,68 @@ class Anomaly(_Answer):
     stop: Instant | None
     score: float
     cause: dict[str, Any] | None
+    message: str = ""
 
 
 class AnomalyList(_Answer):
-    """Anomalies of one twin, the newest first."""
+    """Anomalies of one twin: those that last first, then the newest."""
 
     anomalies: list[Anomaly]
+
+
+class Acknowledgement(_Answer):
+    """When an operator said that he has seen an alarm, and what he added."""
+
+    time: Instant
+    note: str | None
+
+
+class Alarm(_Answer):
+    """A stay of a channel beyond a limit, measured or forecast; ``stop`` is null while it lasts.
+
+    A measured one tells the ``worst`` reading; a forecast one when the limit is ``expected`` to be reached, with the ends of
+    its 90 % interval, ``earliest`` and ``latest``. Values are in the channel's own unit.
+    """
+
+    id: int
+    on: Literal["measured", "forecast"]
+    channel: str
+    colour: Literal["yellow", "red"]
+    side: Literal["low", "high"]
+    limit: float
+    start: Instant
+    stop: Instant | None
+    unit: str | None
+    message: str
+    worst: float | None = None
+    expected: Instant | None = None
+    earliest: Instant | None = None
+    latest: Instant | None = None
+    acknowledged: Acknowledgement | None
+    shelved_until: Instant | None
+
+
+class AlarmList(_Answer):
+    """Alarms of one twin: those first that last and are not shelved, the red ones before the yellow ones."""
+
+    alarms: list[Alarm]
+
+
+class AcknowledgeRequest(_Request):
+    """What to add to an acknowledgement."""
+
+    note: Annotated[str, Field(max_length=500)] | None = None
+
+
+class ShelveRequest(_Request):
+    """For how long nothing is to be heard of a limit; 0 takes it up again."""
+
+    for_s: Annotated[float, BeforeValidator(_finite), Field(ge=0, le=31_536_000)]
 
 
 class Message(_Answer):
     """One message of a stream."""
 
-    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "dropped"]
+    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "alarm", "dropped"]
     seq: int
     time: Instant

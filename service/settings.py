@@ -43,6 +43,9 @@ class Settings(BaseSettings):
         2e-8, gt=0, le=1e-4, description="Chance that a statistic of a healthy sensor alarms at one sample."
     )
     effects: str = Field("", description="Plug-ins with effects of your own: Python files, separated by colons.")
+    limit_horizon_s: float = Field(
+        21_600.0, ge=0, le=1e7, description="How far ahead forecasts are watched for limits; 0: not at all."
+    )
     clock_tolerance_s: float = Field(
         300.0,
         ge=0,

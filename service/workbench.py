@@ -151,6 +151,9 @@ class Workbench(Protocol):
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model in seconds, linearised where the telemetry begins."""
 
+    def score(self, document: str, telemetry: Telemetry) -> float | None:
+        """Return the open-loop error of a model in K over some telemetry, which begins with a burn-in; None if it has none."""
+
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples of channels in these units are no readings."""
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from service.instants import now_us
+from service.instants import now_us, parse_instant
 from service.messages import EventStretch, Stretch
 from service.store import anomalies, events, jobs, models
 from service.workbench import Outcome
@@ -59,13 +59,36 @@ def _summary(finished: Finished) -> Json:
 
 
 def _explain(connection: sqlite3.Connection, twin: int, finished: Finished) -> None:
-    """Give the unexplained anomalies of the sensors that a finding concerns their cause."""
-    if finished.outcome.report is None:
+    """Give the anomalies that the findings explain their cause: at their places, and where the first one let the error fall."""
+    report = finished.outcome.report
+    if report is None:
         return
-    for finding in finished.outcome.report["findings"]:
-        cause = {"effect": finding["effect"], "where": finding["where"], "diagnosis": finished.job}
-        sensors = _sensors_at(finished.outcome.document["spec"], finding["where"])
-        anomalies.explain(connection, twin, [*sensors, TOGETHER], cause)
+    span_us = _instant(report, "train", "start"), _instant(report, "holdout", "stop")
+    causes = [
+        {"effect": finding["effect"], "where": finding["where"], "diagnosis": finished.job}
+        for finding in report["findings"]
+    ]
+    for cause in causes:
+        sensors = _sensors_at(finished.outcome.document["spec"], cause["where"])
+        anomalies.explain(connection, twin, sensors, cause, span_us)
+    anomalies.explain(connection, twin, [*_relieved(report), TOGETHER], causes[0], span_us)
+
+
+FELL = 0.7
+"""A sensor whose held-out error fell to this share of what it was owed it to what was found."""
+
+
+def _relieved(report: Json) -> list[str]:
+    """Return the sensors whose held-out error fell by much."""
+    before, after = (report.get(name, {}).get("per_sensor", {}) for name in ("before", "after"))
+    errors = {name: (before[name].get("rmse_K"), after.get(name, {}).get("rmse_K")) for name in before}
+    return sorted(name for name, (old, new) in errors.items() if old and new is not None and new <= FELL * old)
+
+
+def _instant(report: Json, part: str, end: str) -> int | None:
+    """Return the instant of one end of a part of the record; None where the report does not date it."""
+    value = report.get(part, {}).get(end)
+    return parse_instant(value, end) if isinstance(value, str) else None
 
 
 def _sensors_at(specification: Json, where: Json) -> list[str]:

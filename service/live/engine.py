@@ -39,6 +39,10 @@ class Engine:
         """Return the longest time constant of a model."""
         return await self._ask(_memory_s, self._workbench, document, telemetry)
 
+    async def score(self, document: str, telemetry: Telemetry) -> float | None:
+        """Return the open-loop error of a model."""
+        return await self._ask(_score, self._workbench, document, telemetry)
+
     async def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Return which samples are no readings."""
         return await self._ask(_screen, self._workbench, dict(units), telemetry)
@@ -88,6 +92,10 @@ def _assimilate(workbench: MakeWorkbench, document: str, telemetry: Telemetry, s
 
 def _memory_s(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> float:
     return workbench().memory_s(document, telemetry)
+
+
+def _score(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> float | None:
+    return workbench().score(document, telemetry)
 
 
 def _screen(workbench: MakeWorkbench, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:

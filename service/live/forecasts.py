@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
+from service.live.engine import Engine
 from service.live.position import Position
 from service.live.pulse import Beat
 from service.live.tracker import Tracker
@@ -24,6 +25,9 @@ MOST_POINTS = 20_000
 MOST_STEPS = 200_000
 PAST = 20_000
 """Usual distances of samples, from which is told how inputs go on: two weeks of minutes."""
+
+NEEDED = (0.05, 0.5, 0.95)
+"""Quantiles that every forecast has, by which limits are judged."""
 
 Json = dict[str, Any]
 
@@ -78,7 +82,7 @@ def build_task(
     plan = None if request.plan is None else _plan(twin, request.plan, active.epoch_us)
     if plan is not None:
         _check_span(plan, position.time_us, position.time_us + round(request.horizon_s * 1e6))
-    quantiles = tuple(request.quantiles)
+    quantiles = tuple({*request.quantiles, *NEEDED})
     return ForecastTask(telemetry, position.state, request.horizon_s, step_s, plan, quantiles, request.inputs, past)
 
 
@@ -131,6 +135,25 @@ def silence_s(twin: Entry, beats: Mapping[str, Beat]) -> float | None:
     if not silent or any(beat.standing(at_us) in ("live", "delayed") for beat in sensors):
         return None
     return min(silent)
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look ahead: with which model, from which state, how far that lags, and what it shows."""
+
+    active: Active
+    position: Position
+    lag: "Behind"
+    made: Forecasted
+
+
+async def look_ahead(tracker: Tracker, database: Database, engine: Engine, request: ForecastRequest) -> Look:
+    """Forecast from the present state; Problem if there is none, or if the request asks for too much."""
+    active, position = await state_of(tracker)
+    lag = await behind(tracker, database)
+    past = await past_of(tracker.twin, database, active, position)
+    task = build_task(tracker.twin, active, position, past, request)
+    return Look(active, position, lag, await engine.forecast(active.document, task))
 
 
 @dataclass(frozen=True)
@@ -191,10 +214,9 @@ def notices(tracker: Tracker, position: Position, lag: Behind, silent_s: float |
     return told
 
 
-def render(
-    twin: Entry, active: Active, position: Position, lag: Behind, made: Forecasted, quantiles: Sequence[float]
-) -> Json:
+def render(twin: Entry, look: Look, quantiles: Sequence[float], limits: Sequence[Json]) -> Json:
     """Return a forecast as clients see it."""
+    active, position, made = look.active, look.position, look.made
     values = {
         sensor: {"mean": mean.tolist()} | {quantile_name(q): made.quantiles[q][sensor].tolist() for q in quantiles}
         for sensor, mean in made.mean.items()
@@ -203,7 +225,7 @@ def render(
         "model_version": active.version,
         "issued": format_instant(now_us()),
         "from": format_instant(position.time_us),
-        "behind_s": lag.seconds,
+        "behind_s": look.lag.seconds,
         "time": format_instants(made.time_us),
         "values": values,
         "whole": {
@@ -212,5 +234,6 @@ def render(
         },
         "units": {sensor: twin.units[sensor] for sensor in made.mean},
         "inputs": dict(made.inputs),
+        "limits": list(limits),
         "notices": list(made.notices),
     }

@@ -4,7 +4,9 @@ import copy
 
 from service.live import pulse as pulses
 from service.live.engine import Engine
+from service.live.limits import LimitWatch
 from service.live.pulse import Beat, Pulse
+from service.live.scores import Scores
 from service.live.tracker import Tracker
 from service.metrics import Metrics
 from service.problems import Problem
@@ -19,7 +21,13 @@ class Live:
     """Every tracker of this service."""
 
     def __init__(
-        self, database: Database, hub: Hub, metrics: Metrics, workbench: MakeWorkbench, false_alarm_rate: float
+        self,
+        database: Database,
+        hub: Hub,
+        metrics: Metrics,
+        workbench: MakeWorkbench,
+        false_alarm_rate: float,
+        limit_horizon_s: float,
     ) -> None:
         """Start without twins."""
         self.engine = Engine(workbench)
@@ -27,6 +35,8 @@ class Live:
         self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
         self._pulses: dict[int, Pulse] = {}
+        self.scores = Scores(database, self.engine)
+        self._limits = LimitWatch(database, hub, self.engine, self.find, limit_horizon_s)
 
     def add(self, twin: Entry) -> None:
         """Begin to track a twin."""
@@ -37,6 +47,8 @@ class Live:
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""
         self._pulses.pop(twin.key, None)
+        self._limits.forget(twin)
+        self.scores.forget(twin)
         tracker = self._trackers.pop(twin.key, None)
         if tracker is not None:
             await tracker.close()
@@ -63,12 +75,14 @@ class Live:
 
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""
+        self._limits.arrived(twin)
         tracker = self._trackers.get(twin.key)
         if tracker is not None:
             tracker.arrived()
 
     def archive_changed(self, twin: Entry) -> None:
         """Pass on that stored samples were taken away."""
+        self._limits.arrived(twin)
         tracker = self._trackers.get(twin.key)
         if tracker is not None:
             tracker.archive_changed()
@@ -85,6 +99,8 @@ class Live:
 
     async def close(self) -> None:
         """Stop everything."""
+        await self._limits.close()
+        await self.scores.close()
         for tracker in self._trackers.values():
             await tracker.close()
         await self.engine.close()

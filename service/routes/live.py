@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Response
 from service.deps import NamedTwin, Running, Service, reads
 from service.downsample import extremes
 from service.instants import format_instant, format_instants
-from service.live import forecasts, screening
+from service.live import forecasts, limits, screening
 from service.registry import Entry
 from service.routes.telemetry import MOST_POINTS, span
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Inputs, Network, Residuals
@@ -45,14 +45,11 @@ async def forecast_as_is(
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
     tracker = service.live.tracker(twin)
-    active, position = await forecasts.state_of(tracker)
-    lag = await forecasts.behind(tracker, service.database)
     silent_s = forecasts.silence_s(twin, await service.live.beats(twin))
-    past = await forecasts.past_of(twin, service.database, active, position)
-    task = forecasts.build_task(twin, active, position, past, request)
-    made = await service.live.engine.forecast(active.document, task)
-    document = forecasts.render(twin, active, position, lag, made, request.quantiles)
-    document["notices"] += forecasts.notices(tracker, position, lag, silent_s)
+    look = await forecasts.look_ahead(tracker, service.database, service.live.engine, request)
+    expected = list(limits.expected(twin, look.position.time_us, look.made))
+    document = forecasts.render(twin, look, request.quantiles, expected)
+    document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
     return Response(orjson.dumps(document), media_type="application/json")
 
 

@@ -14,6 +14,8 @@ from twin_core.network.spec_io import load_spec
 
 router = APIRouter(prefix="/v1/twins/{twin}/models", tags=["models"])
 
+MOST_COMPARED = 30
+"""So many of the newest versions are compared over the same telemetry."""
 Version = Annotated[int, Path(ge=1, le=2**62, description="Number of a version.")]
 
 
@@ -22,8 +24,10 @@ async def list_models(service: Running, twin: NamedTwin) -> ModelList:
     """List every version, the oldest first, and the log of activations."""
     rows = await service.database.read(models.select, twin.key)
     log = await service.database.read(models.activations, twin.key)
+    errors = await service.live.scores.of(twin, [row.version for row in rows][-MOST_COMPARED:])
     return ModelList(
-        models=[ModelInfo(**row.wire()) for row in rows], activations=[Activation(**entry) for entry in log]
+        models=[ModelInfo(**row.wire() | {"error": errors.get(row.version)}) for row in rows],
+        activations=[Activation(**entry) for entry in log],
     )
 
 

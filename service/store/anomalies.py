@@ -9,6 +9,14 @@ import orjson
 
 from service.instants import format_instant
 
+WORDS = {
+    "residual": "departs from its model",
+    "stuck": "is frozen: it repeats one reading",
+    "quantised": "repeats its readings more often than it used to",
+    "dropout": "does not report while others do",
+    "joint": "together depart from their model",
+}
+
 
 @dataclass(frozen=True)
 class AnomalyRow:
@@ -34,6 +42,7 @@ class AnomalyRow:
             "cause": None if self.cause is None else orjson.loads(self.cause),
             "kind": self.kind,
             "model_version": self.version,
+            "message": f"{'all sensors' if self.sensor == '*' else self.sensor} {WORDS.get(self.kind, self.kind)}",
         }
 
 
@@ -69,9 +78,12 @@ def apply(
         known = _same(connection, twin, version, change, span_us[0], confirmed)
         if known is None:
             cursor = connection.execute(
-                """INSERT INTO anomaly (twin, version, sensor, kind, start_us, stop_us, score)
-                   VALUES (?, ?, ?, ?, ?, ?, ?)""",
-                (twin, version, change.sensor, change.kind, change.start_us, change.stop_us, change.score),
+                """INSERT INTO anomaly (twin, version, sensor, kind, start_us, stop_us, score, cause)
+                   VALUES (?, ?, ?, ?, ?, ?, ?, ?)""",
+                (
+                    *(twin, version, change.sensor, change.kind, change.start_us, change.stop_us, change.score),
+                    _known_cause(connection, twin, version, change),
+                ),
             )
             number = int(cursor.lastrowid or 0)
         else:
@@ -125,7 +137,7 @@ def select(
     stop_us: int | None = None,
     version: int | None = None,
 ) -> list[AnomalyRow]:
-    """Return the intervals that touch start <= time < stop, the newest first: those of the active model, or of another.
+    """Return the intervals that touch start <= time < stop, of the active model or of another: what lasts first, then the newest.
 
     What lasted when a model was last followed counts as ended there.
     """
@@ -134,7 +146,7 @@ def select(
     row = connection.execute("SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1", (twin,))
     active = next((number for (number,) in row), None)
     chosen = active if version is None else version
-    query = _SELECT + "WHERE twin = ? AND version = ? AND start_us < ? ORDER BY start_us DESC, id"
+    query = _SELECT + "WHERE twin = ? AND version = ? AND start_us < ? ORDER BY stop_us IS NULL DESC, start_us DESC, id"
     rows = [AnomalyRow(*row) for row in connection.execute(query, (twin, chosen, stop))]
     if chosen != active:
         last = connection.execute("SELECT max(time_us) FROM checkpoint WHERE twin = ? AND version = ?", (twin, chosen))
@@ -143,12 +155,43 @@ def select(
     return [row for row in rows if row.stop_us is None or row.stop_us >= start]
 
 
-def explain(connection: sqlite3.Connection, twin: int, sensors: Sequence[str], cause: dict[str, Any]) -> None:
-    """Name the cause of the unexplained anomalies of some sensors."""
+OF_THE_MODEL = ("residual", "joint")
+"""Kinds that say that the model is off; the others are seen in the readings alone, and no missing heat explains them."""
+
+
+def explain(
+    connection: sqlite3.Connection,
+    twin: int,
+    sensors: Sequence[str],
+    cause: dict[str, Any],
+    span_us: tuple[int | None, int | None],
+) -> None:
+    """Name the cause of the unexplained anomalies of some sensors in the time (first, last) in which it was found."""
+    first_us, last_us = span_us
     text = orjson.dumps(cause).decode()
-    for sensor in sensors:
-        query = "UPDATE anomaly SET cause = ? WHERE twin = ? AND sensor = ? AND cause IS NULL"
-        connection.execute(query, (text, twin, sensor))
+    query = f"""UPDATE anomaly SET cause = ? WHERE twin = ? AND cause IS NULL AND kind IN {OF_THE_MODEL}
+                AND start_us <= ? AND coalesce(stop_us, ?) >= ? AND sensor = ?"""
+    span = (2**62 if last_us is None else last_us, 2**62, -(2**62) if first_us is None else first_us)
+    connection.executemany(query, [(text, twin, *span, sensor) for sensor in sensors])
+
+
+def _known_cause(connection: sqlite3.Connection, twin: int, version: int, change: Change) -> str | None:
+    """Return the cause that the same anomaly has under another model, unless the model at hand has that effect already."""
+    if change.kind not in OF_THE_MODEL:
+        return None
+    query = """SELECT cause FROM anomaly WHERE twin = ? AND sensor = ? AND kind = ? AND cause IS NOT NULL
+               AND start_us <= ? AND coalesce(stop_us, ?) >= ? ORDER BY id DESC LIMIT 1"""
+    until_us = 2**62 if change.stop_us is None else change.stop_us
+    place = (twin, change.sensor, change.kind, until_us, 2**62, change.start_us)
+    row = connection.execute(query, place).fetchone()
+    if row is None:
+        return None
+    cause = orjson.loads(row[0])
+    query = "SELECT summary FROM model WHERE twin = ? AND version = ?"
+    summary = connection.execute(query, (twin, version)).fetchone()
+    effects = [] if summary is None else orjson.loads(summary[0]).get("effects", [])
+    has_it = any((e["effect"], e["where"]) == (cause["effect"], cause["where"]) for e in effects)
+    return None if has_it else str(row[0])
 
 
 def open_ids(connection: sqlite3.Connection, twin: int, version: int | None) -> list[int]:

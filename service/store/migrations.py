@@ -194,12 +194,43 @@ def _clocks(connection: sqlite3.Connection) -> None:
     )
 
 
+def _alarms(connection: sqlite3.Connection) -> None:
+    """Add alarms of limits, and how far the archive was watched."""
+    _run(
+        connection,
+        """
+        CREATE TABLE alarm (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            origin TEXT NOT NULL,
+            channel TEXT NOT NULL,
+            colour TEXT NOT NULL,
+            side TEXT NOT NULL,
+            bound REAL NOT NULL,
+            start_us INTEGER NOT NULL,
+            stop_us INTEGER,
+            body TEXT NOT NULL,
+            acknowledged_us INTEGER,
+            note TEXT,
+            shelved_until_us INTEGER
+        );
+        CREATE INDEX alarm_twin ON alarm (twin, stop_us, start_us);
+        CREATE TABLE watched (
+            twin INTEGER PRIMARY KEY REFERENCES twin(id) ON DELETE CASCADE,
+            seq INTEGER NOT NULL,
+            state TEXT NOT NULL
+        );
+        """,
+    )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
     ("residuals and anomalies", _residuals_and_anomalies),
     ("outlines", _outlines),
     ("clocks", _clocks),
+    ("alarms", _alarms),
 )
 
 

@@ -67,6 +67,9 @@ def _forget(connection: sqlite3.Connection, twin: int, start_us: int, stop_us: i
     connection.execute("DELETE FROM checkpoint WHERE twin = ? AND time_us >= ?", (twin, start_us))
     query = "DELETE FROM anomaly WHERE twin = ? AND start_us >= ? AND start_us < ?"
     connection.execute(query, (twin, start_us, stop_us))
+    query = "DELETE FROM alarm WHERE twin = ? AND origin = 'measured' AND start_us >= ? AND start_us < ?"
+    connection.execute(query, (twin, start_us, stop_us))
+    connection.execute("DELETE FROM watched WHERE twin = ?", (twin,))
     query = """SELECT DISTINCT version, length(value) / (8 * n) FROM residual
                WHERE twin = ? AND last_us >= ? AND first_us < ?"""
     for version, n_rows in connection.execute(query, (twin, start_us, stop_us)).fetchall():

@@ -1,23 +1,32 @@
-"""What an alarm asks of each twin: when its last sample was taken, and how many anomalies are open."""
+"""What an alarm asks of each twin: when its last sample was taken, and what is open."""
 
 import sqlite3
 from dataclasses import dataclass
 
+from service.instants import now_us
+
 
 @dataclass(frozen=True)
 class Vitals:
-    """One twin at a glance; ``last_us`` is None while its archive is empty."""
+    """One twin at a glance; ``last_us`` is None while its archive is empty. Alarms that are shelved do not count."""
 
     twin: str
     last_us: int | None
     open_anomalies: int
+    yellow: int
+    red: int
 
 
 def select(connection: sqlite3.Connection) -> list[Vitals]:
     """Return the vitals of every twin."""
     rows = connection.execute(
         """SELECT twin.name, head.last_us,
-                  (SELECT count(*) FROM anomaly WHERE anomaly.twin = twin.id AND anomaly.stop_us IS NULL)
-           FROM twin JOIN head ON head.twin = twin.id"""
+                  (SELECT count(*) FROM anomaly WHERE anomaly.twin = twin.id AND anomaly.stop_us IS NULL),
+                  (SELECT count(*) FROM alarm WHERE colour = 'yellow' AND alarm.twin = twin.id AND stop_us IS NULL
+                   AND coalesce(shelved_until_us, 0) <= :now),
+                  (SELECT count(*) FROM alarm WHERE colour = 'red' AND alarm.twin = twin.id AND stop_us IS NULL
+                   AND coalesce(shelved_until_us, 0) <= :now)
+           FROM twin JOIN head ON head.twin = twin.id""",
+        {"now": now_us()},
     )
     return [Vitals(*row) for row in rows]

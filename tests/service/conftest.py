@@ -1,12 +1,16 @@
 """A service in memory's place: one temporary file per test, driven through its real routes."""
 
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from service.app import create_app
+from service.live import engine
 from service.settings import read_settings
 from tests.service.harness import AppClient
 
@@ -35,9 +39,54 @@ def spec() -> dict[str, Any]:
     return dict(SPEC)
 
 
+class StandingWorkers:
+    """Worker processes that outlive the services of single tests: each takes a second to start."""
+
+    def __init__(self, workers: int) -> None:
+        """Start nothing yet."""
+        self._workers = workers
+        self._environment: dict[str, str] = {}
+        self._pool: ProcessPoolExecutor | None = None
+
+    def submit(self, function: Callable[..., Any], *args: Any) -> Future[Any]:
+        """Run a function in one of them; those that died, or know another environment, are replaced."""
+        environment = {name: value for name, value in os.environ.items() if name != "PYTEST_CURRENT_TEST"}
+        if environment != self._environment:
+            self.end()
+            self._environment = environment
+        try:
+            self._pool = self._pool or START(self._workers)
+            return self._pool.submit(function, *args)
+        except BrokenProcessPool:
+            self._pool = None
+            raise
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Stay: a service ends."""
+
+    def end(self) -> None:
+        """End the processes."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool = None
+
+
+START = engine._start
+
+
+@pytest.fixture(scope="session")
+def standing_workers() -> Iterator[StandingWorkers]:
+    workers = StandingWorkers(engine.WORKERS)
+    yield workers
+    workers.end()
+
+
 @pytest.fixture
-def make_client(tmp_path: Path) -> Iterator[MakeClient]:
+def make_client(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, standing_workers: StandingWorkers
+) -> Iterator[MakeClient]:
     """Return a function that starts a service on the test's database; all are stopped at the end."""
+    monkeypatch.setattr(engine, "_start", lambda workers: START(1) if workers == 1 else standing_workers)
     opened: list[AppClient] = []
 
     def make(workbench: Any = None, **settings: Any) -> AppClient:

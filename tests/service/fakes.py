@@ -1,5 +1,6 @@
 """A workbench that answers at once, for tests of everything around the science."""
 
+import json
 import os
 import time
 from collections.abc import Mapping
@@ -91,6 +92,10 @@ class FakeWorkbench:
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Forget within half a minute."""
         return 30.0
+
+    def score(self, document: str, telemetry: Telemetry) -> float | None:
+        """Score a model by what its document says of it."""
+        return float(json.loads(document)["rmse_K"])
 
     def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
         """Take everything for a reading."""

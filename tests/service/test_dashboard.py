@@ -94,6 +94,21 @@ def test_what_is_not_of_the_present_is_told(server: Server, page: Browser) -> No
     assert page.troubles == []
 
 
+def test_alarms_are_acknowledged_and_shelved(server: Server, page: Browser) -> None:
+    limits = {"yellow": [None, 295.0], "red": [None, 400.0]}
+    limited = {**SPEC["channels"], "T_px": {**SPEC["channels"]["T_px"], "limits": limits}}
+    server.client().register({**SPEC, "channels": limited})
+    server.client().ingest("benchsat", [9000, 9001, 9002], {"T_px": [290.0, 296.0, 297.0]})
+    page.until("document.getElementById('alarms').innerText.includes('above its yellow limit of 295 K')")
+    page.click("#alarms button:first-of-type")
+    page.until("document.getElementById('alarms').innerText.includes('acknowledged')")
+    page.click("#alarms button:last-of-type")
+    page.until("document.querySelector('#alarms .quietly')")
+    page.click("#alarms button:last-of-type")
+    page.until("!document.querySelector('#alarms .quietly')")
+    assert page.troubles == []
+
+
 def test_keys_zoom_and_small_screens(server: Server, page: Browser) -> None:
     server.client().register(SPEC)
     send(server, 0)

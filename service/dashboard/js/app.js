@@ -3,7 +3,7 @@ import { ApiError, call, follow, onKeyNeeded } from "./api.js";
 import { ResidualChart, TemperatureChart, forecastLength } from "./charts.js";
 import { clock, colour, count, isDark, make, seconds, span, toUnit, unitName } from "./format.js";
 import { NetworkDrawing, declared } from "./network.js";
-import { drawAnomalies, drawJobs, drawModels, drawNow } from "./panels.js";
+import { drawAlarms, drawAnomalies, drawJobs, drawModels, drawNow } from "./panels.js";
 
 const $ = (id) => document.getElementById(id);
 const RANGES = [["1 h", 3600], ["6 h", 21600], ["1 d", 86400], ["7 d", 604800], ["all", Infinity]];
@@ -13,7 +13,7 @@ const CATCH_UP_MS = 1000;  // what is assimilated in arrears is not told one by 
 
 const state = {
   twin: null, detail: null, range_s: 86400, zoom: null, unit: null, kind: "residual", hidden: new Set(),
-  latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null, link: "off",
+  latest: {}, anomalies: [], alarms: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null, link: "off",
 };
 let zoomTo = () => {};
 const temperatures = new TemperatureChart($("temperatures"), (ends) => zoomTo(ends));
@@ -88,7 +88,9 @@ async function load(parts) {
     const lists = await Promise.all([call(`${path}/calibrations`), call(`${path}/diagnoses`)]);
     for (const job of lists.flatMap((l) => l.jobs)) state.jobs.set(job.id, job);
   }
-  if (parts.has("anomalies")) state.anomalies = (await call(`${path}/anomalies`)).anomalies;
+  if (parts.has("anomalies")) {
+    [state.anomalies, state.alarms] = await Promise.all([call(`${path}/anomalies`).then((a) => a.anomalies), call(`${path}/alarms`).then((a) => a.alarms)]);
+  }
   if (parts.has("plots") && state.detail.last_time) await loadPlots(path);
   if (state.twin !== twin) return;
   render(parts);
@@ -169,6 +171,7 @@ function renderPlots() {
   const list = sensors(), unit = unitShown(), from = units();
   $("unit").textContent = unitName(unit);
   renderLegend(list);
+  drawAlarms($("alarms"), state.alarms.filter((a) => a.stop === null), { onAcknowledge: (a) => tell(a, "acknowledge"), onShelve: (a) => tell(a, "shelve", { for_s: a.shelved_until ? 0 : 3600 }) });
   drawAnomalies($("anomalies"), state.anomalies, list, standing(), (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
   const open = state.anomalies.filter((a) => a.stop === null).length;
   $("anomaly-note").textContent = open ? `${open} open` : "";
@@ -283,6 +286,11 @@ const openReport = (job) => attempt(async () => {
   $("report-dialog").showModal();
 });
 
+const tell = (alarm, what, body = {}) => attempt(async () => {
+  await call(`v1/twins/${state.twin}/alarms/${alarm.id}/${what}`, { method: "POST", body });
+  refresh("anomalies");
+});
+
 zoomTo = (ends) => {
   state.zoom = ends;
   drawRanges();
@@ -317,7 +325,7 @@ function hear(message) {
     if (!state.zoom) refresh("plots");
   } else if (message.type === "residual") {
     if (!state.zoom) refresh("plots");
-  } else if (message.type === "anomaly") {
+  } else if (message.type === "anomaly" || message.type === "alarm") {
     refresh("anomalies");
   } else if (message.type === "job") {
     state.jobs.set(message.job.id, message.job);
@@ -332,7 +340,7 @@ function hear(message) {
 
 function select(twin) {
   if (state.stop) state.stop.abort();
-  Object.assign(state, { twin, detail: null, zoom: null, hidden: new Set(), latest: {}, anomalies: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, network: null });
+  Object.assign(state, { twin, detail: null, zoom: null, hidden: new Set(), latest: {}, anomalies: [], alarms: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, network: null });
   state.stop = new AbortController();
   $("twin").value = twin;
   location.hash = twin;

@@ -52,6 +52,19 @@ export function drawAnomalies(list, anomalies, sensors, standing, onPick) {
   }));
 }
 
+// Alarms that last: what is wrong in words, and what an operator can say to it.
+export function drawAlarms(list, alarms, { onAcknowledge, onShelve }) {
+  list.hidden = !alarms.length;
+  list.replaceChildren(...alarms.map((alarm) => {
+    const quietly = alarm.shelved_until !== null;
+    return make("li", { class: `alarm ${quietly ? "quietly" : ""}` },
+      make("div", { class: "row" }, make("span", { class: `chip ${alarm.colour === "red" ? "bad" : "warn"}` }, `${alarm.colour}${alarm.on === "forecast" ? ", forecast" : ""}`),
+        alarm.acknowledged ? make("span", { class: "sub", title: alarm.acknowledged.note || "" }, "acknowledged") : make("button", { class: "small", onclick: () => onAcknowledge(alarm) }, "Acknowledge"),
+        make("button", { class: "small", onclick: () => onShelve(alarm), title: quietly ? `until ${alarm.shelved_until}` : "hear nothing of this limit for an hour" }, quietly ? "Unshelve" : "Shelve 1 h")),
+      make("div", { class: "message" }, `${alarm.message} · since ${clock(seconds(alarm.start))}`));
+  }));
+}
+
 const LOOK = { queued: "", running: "accent", succeeded: "good", failed: "bad", cancelled: "warn" };
 
 export function drawJobs(list, jobs, { onCancel, onReport }) {
@@ -86,14 +99,15 @@ export function drawModels(table, models, onActivate) {
     make("td", {}, make("span", { class: `chip ${model.source === "diagnosis" ? "accent" : ""}` }, model.source)),
     make("td", { class: "sub" }, clock(seconds(model.created))),
     make("td", { class: "sub" }, model.train.samples ? `${count(model.train.samples)} samples` : "–"),
-    make("td", {}, errorCell(model.validation)),
+    make("td", {}, errorCell(model)),
     make("td", { class: "grow" }, ...(model.effects.length ? model.effects.map((e) => make("span", { class: "chip accent" }, effectWords(e))) : [make("span", { class: "sub" }, "none")])),
     make("td", {}, model.active ? null : make("button", { class: "small", onclick: () => onActivate(model) }, "Activate"))));
   table.replaceChildren(make("thead", {}, head), make("tbody", {}, ...rows));
 }
 
-function errorCell(validation) {
-  const after = make("b", { title: validation.on || "" }, `${number(validation.rmse_K, 3)} K`);
-  if (!Number.isFinite(validation.before_rmse_K)) return after;
-  return make("span", { class: "fall" }, make("s", {}, `${number(validation.before_rmse_K, 3)}`), "→", after);
+// One measure for all versions: the same recent samples, open loop. What its maker measured is told beside it.
+function errorCell({ error, validation }) {
+  const made = Number.isFinite(validation.rmse_K) ? `${number(validation.rmse_K, 3)} K ${validation.on ? `on ${validation.on}` : "when it was made"}` : "no error was found when it was made";
+  if (!error) return make("span", { class: "sub", title: made }, "–");
+  return make("b", { title: `over the newest ${count(error.samples)} samples, open loop; ${made}` }, `${number(error.rmse_K, 3)} K`);
 }

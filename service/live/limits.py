@@ -1,0 +1,234 @@
+"""The watch over limits: every new reading of a channel that has any, and now and then what a forecast says of it."""
+
+import asyncio
+import logging
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from service.instants import format_instant, in_words, now_us
+from service.live import forecasts
+from service.live.engine import Engine
+from service.live.tracker import Tracker
+from service.messages import EventStretch, Stretch
+from service.problems import Problem
+from service.registry import Entry
+from service.schemas import ForecastRequest
+from service.store import alarms, events, samples
+from service.store.alarms import AlarmRow, Limit
+from service.store.database import Database
+from service.store.gone import TwinGone
+from service.store.samples import Samples
+from service.streams import Hub
+from service.workbench import Forecasted
+from twin_core.anomaly.limits import LEAST_BAND, NOISES, Ahead, reaches, watch
+from twin_core.errors import TwinError
+from twin_core.quality.sentinels import marked
+from twin_core.units import to_si
+
+log = logging.getLogger("service.live")
+
+Json = dict[str, Any]
+
+PAUSE_S = 0.2
+"""Shortest time between two looks, so that samples sent one by one are watched together."""
+FORECAST_EVERY_S = 60.0
+MOST_PAST = 100_000
+"""Of an archive that nobody has watched so far, so many of the newest samples are looked through."""
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+STEPS = 180
+MEASURED, FORECAST = "measured", "forecast"
+
+
+def limits_of(twin: Entry, origin: str) -> list[Limit]:
+    """Return the limits of a twin; forecast are temperatures only."""
+    found = []
+    for name, channel in twin.spec.channels.items():
+        if channel.limits is None or (origin == FORECAST and name not in twin.sensors):
+            continue
+        for colour in ("yellow", "red"):
+            for side, bound in zip(("low", "high"), getattr(channel.limits, colour) or (None, None), strict=True):
+                if bound is not None:
+                    found.append(Limit(origin, name, colour, side, float(bound)))
+    return found
+
+
+class LimitWatch:
+    """Watches the twins that have limits."""
+
+    def __init__(
+        self,
+        database: Database,
+        hub: Hub,
+        engine: Engine,
+        find: Callable[[int], Tracker | None],
+        horizon_s: float,
+    ) -> None:
+        """Look ``horizon_s`` ahead; 0: not at all."""
+        self._database, self._hub, self._engine, self._find = database, hub, engine, find
+        self._horizon_s = horizon_s
+        self._loop = asyncio.get_running_loop()
+        self._due: dict[int, Entry] = {}
+        self._foreseen_s: dict[int, float] = {}
+        self._wake = asyncio.Event()
+        self._task = asyncio.create_task(self._run())
+
+    def arrived(self, twin: Entry) -> None:
+        """Hear that samples were stored, or taken away."""
+        if limits_of(twin, MEASURED):
+            self._due[twin.key] = twin
+            self._wake.set()
+
+    def forget(self, twin: Entry) -> None:
+        """Watch a twin no longer."""
+        self._due.pop(twin.key, None)
+        self._foreseen_s.pop(twin.key, None)
+
+    async def close(self) -> None:
+        """Stop."""
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+    async def _run(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            due, self._due = self._due, {}
+            for twin in due.values():
+                try:
+                    await self._hub.write(twin.key, look, twin)
+                    await self._foresee(twin)
+                except TwinGone:
+                    continue
+                except Exception:
+                    log.exception("limits could not be watched", extra={"twin": twin.name})
+            await asyncio.sleep(PAUSE_S)
+
+    async def _foresee(self, twin: Entry) -> None:
+        """Look ahead, unless that was done just now."""
+        tracker = self._find(twin.key)
+        limits = limits_of(twin, FORECAST)
+        if self._horizon_s == 0.0 or tracker is None or not limits:
+            return
+        wait_s = self._foreseen_s.get(twin.key, -FORECAST_EVERY_S) + FORECAST_EVERY_S - self._loop.time()
+        if wait_s > 0.0:
+            self._loop.call_later(wait_s, self.arrived, twin)
+            return
+        self._foreseen_s[twin.key] = self._loop.time()
+        request = ForecastRequest(horizon_s=self._horizon_s, step_s=self._horizon_s / STEPS, quantiles=list(QUANTILES))
+        try:
+            found = await forecasts.look_ahead(tracker, self._database, self._engine, request)
+        except (Problem, TwinError):
+            self._foreseen_s.pop(twin.key, None)
+            return  # there is no state yet
+        await self._hub.write(twin.key, foresee, twin, limits, found.position.time_us, found.made)
+
+
+def look(connection: sqlite3.Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
+    """Watch what arrived since the last look; what is older than that raises nothing."""
+    seq, state = alarms.watched(connection, twin.key)
+    latest, n = samples.latest_seq(connection, twin.key), len(twin.channels)
+    if seq < 0:
+        fresh = samples.newest(connection, twin.key, n, MOST_PAST)
+    else:
+        _, found = samples.since_seq(connection, twin.key, n, seq)
+        order = np.argsort(found.time_us, kind="stable")
+        fresh = Samples(found.time_us[order], found.values[:, order])
+    new = fresh.time_us > state.get("time_us", -(2**62))
+    time_us, values = fresh.time_us[new], fresh.values[:, new]
+    if not time_us.size:
+        return None, ()
+    after: Json = {"time_us": int(time_us[-1])}
+    news: list[AlarmRow] = []
+    for limit in limits_of(twin, MEASURED):
+        key = f"{limit.channel}/{limit.colour}/{limit.side}"
+        column, unit = values[twin.channels.index(limit.channel)], twin.units[limit.channel]
+        if unit in ("K", "degC"):
+            column = np.where(marked(to_si(column, unit), unit), np.nan, column)
+        band = _band(twin, limit)
+        after[key], crossings = watch(state.get(key, {}), limit.bound, limit.side, band, time_us, column)  # type: ignore[arg-type]
+        for crossing in crossings:
+            body = {"unit": unit, "worst": crossing.worst, "message": _says(limit, unit, crossing.worst)}
+            row = alarms.write(connection, twin.key, limit, crossing.start, crossing.stop, body)
+            news += [] if row is None else [row]
+    alarms.watch(connection, twin.key, latest, after)
+    return None, _told(connection, twin, news)
+
+
+def foresee(
+    connection: sqlite3.Connection, twin: Entry, limits: Sequence[Limit], from_us: int, made: Forecasted
+) -> tuple[None, Sequence[Stretch]]:
+    """Raise an alarm where a limit is reached in half of the futures; end it where it is in less than a quarter."""
+    lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
+    news: list[AlarmRow] = []
+    for limit in limits:
+        known = lasting.get(limit)
+        is_there = Limit(MEASURED, limit.channel, limit.colour, limit.side, limit.bound) in lasting
+        ahead, may = reached(limit, from_us, made)
+        if known is not None and (is_there or not may):
+            news.append(alarms.end(connection, twin.key, known.id, from_us))
+        elif not is_there and (known is not None or ahead.expected_s is not None):
+            body = describe(limit, twin.units[limit.channel], from_us, ahead)
+            start_us = from_us if known is None else known.start_us
+            row = alarms.write(connection, twin.key, limit, start_us, None, body)
+            news += [] if row is None else [row]
+    return None, _told(connection, twin, news)
+
+
+def reached(limit: Limit, from_us: int, made: Forecasted) -> tuple[Ahead, bool]:
+    """Return when a forecast reaches a limit, and whether a quarter of the futures at least do."""
+    time_s = (made.time_us - from_us) / 1e6
+    quantiles = {q: columns[limit.channel] for q, columns in made.quantiles.items()}
+    ahead = reaches(time_s, quantiles, limit.bound, limit.side)  # type: ignore[arg-type]
+    outer = quantiles.get(0.75 if limit.side == "high" else 0.25)
+    may = outer is not None and bool((outer >= limit.bound if limit.side == "high" else outer <= limit.bound).any())
+    return ahead, may
+
+
+def expected(twin: Entry, from_us: int, made: Forecasted) -> Iterator[Json]:
+    """Yield what a forecast says of each limit that it may reach, in one future of twenty at least."""
+    for limit in limits_of(twin, FORECAST):
+        ahead, _ = reached(limit, from_us, made)
+        if ahead.earliest_s is not None:
+            place = {"channel": limit.channel, "colour": limit.colour, "side": limit.side, "limit": limit.bound}
+            yield place | describe(limit, twin.units[limit.channel], from_us, ahead)
+
+
+def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json:
+    """Return in words and instants when a limit is reached."""
+
+    def when(seconds: float | None) -> str | None:
+        return None if seconds is None else format_instant(from_us + round(seconds) * 1_000_000)
+
+    bound = f"its {limit.colour} limit of {limit.bound:g} {unit or ''}".rstrip()
+    if ahead.expected_s is None:
+        first = "" if ahead.earliest_s is None else f" in {in_words(ahead.earliest_s)} at the earliest"
+        message = f"{limit.channel} may reach {bound}{first}"
+    else:
+        latest = "after the end of the forecast" if ahead.latest_s is None else in_words(ahead.latest_s)
+        message = f"{limit.channel} reaches {bound} in {in_words(ahead.expected_s)}"
+        message += f" (90 %: {in_words(ahead.earliest_s or 0.0)} to {latest})"
+    ends = {"expected": ahead.expected_s, "earliest": ahead.earliest_s, "latest": ahead.latest_s}
+    return {"unit": unit, "message": message} | {name: when(seconds) for name, seconds in ends.items()}
+
+
+def _band(twin: Entry, limit: Limit) -> float:
+    noise = twin.spec.channels[limit.channel].noise_std
+    return LEAST_BAND if noise is None else NOISES * float(noise)
+
+
+def _says(limit: Limit, unit: str | None, worst: float) -> str:
+    where = "above" if limit.side == "high" else "below"
+    return f"{limit.channel} is {where} its {limit.colour} limit of {limit.bound:g} {unit or ''}".rstrip() + (
+        f": {worst:.4g} at worst"
+    )
+
+
+def _told(connection: sqlite3.Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:
+    """Return the messages that tell of alarms; nobody hears of those that are shelved."""
+    messages = [("alarm", {"alarm": row.wire()}) for row in news if not row.is_shelved(now_us())]
+    if not messages:
+        return ()
+    return [EventStretch(tuple(events.append(connection, twin.key, now_us(), messages)))]

@@ -1,0 +1,200 @@
+"""Limits as an operator meets them: readings and forecasts beyond them, alarms that are acknowledged and shelved."""
+
+import copy
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from service.workbench import Forecasted, ForecastTask
+from tests.service.conftest import SPEC
+from tests.service.fakes import FakeWorkbench
+from tests.service.harness import AppClient
+from tests.service.test_live import messages
+
+TWIN = "/v1/twins/benchsat"
+LIMITED: dict[str, Any] = copy.deepcopy(SPEC)
+LIMITED["channels"]["T_px"]["limits"] = {"yellow": [280.0, 300.0], "red": [270.0, 310.0]}
+LIMITED["channels"]["T_tank"]["limits"] = {"yellow": [None, 40.0]}
+LIMITED["channels"]["Q_px"]["limits"] = {"red": [None, 100.0]}
+
+
+class Warming(FakeWorkbench):
+    """Foresees that T_px rises by 0.01 K/s, with 5 % and 95 % at 4 K on both sides."""
+
+    def forecast(self, document: str, task: ForecastTask) -> Forecasted:
+        made = super().forecast(document, task)
+        ahead_s = (made.time_us - task.telemetry.time_us[-1]) / 1e6
+        mean = made.mean["T_px"] + 0.01 * ahead_s
+        made.mean["T_px"] = mean
+        for q, columns in made.quantiles.items():
+            columns["T_px"] = mean + 4.0 * (q - 0.5) / 0.45
+            columns["T_tank"] = np.full(mean.size, 15.0)
+        return made
+
+
+@pytest.fixture
+def client(make_client) -> AppClient:
+    client = make_client(workbench=Warming)
+    client.post("/v1/twins", json=LIMITED)
+    return client
+
+
+def send(client: AppClient, times: list[float], T_px: list[float], **more: list) -> None:
+    values = {"T_px": T_px, "T_tank": [15.0] * len(times), "Q_px": [0.5] * len(times), **more}
+    assert client.post(f"{TWIN}/telemetry", json={"time": times, "values": values}).status_code == 200
+
+
+def alarms(client: AppClient, count: int, **wanted: Any) -> list[dict]:
+    """Return the alarms once there are so many of them that are as wanted."""
+    for _ in range(200):
+        rows = client.get(f"{TWIN}/alarms").json()["alarms"]
+        found = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+        if len(found) == count:
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"not {count} of {wanted}: {rows}")
+
+
+def test_a_reading_beyond_a_limit_raises_an_alarm_that_ends_with_a_dead_band(client: AppClient) -> None:
+    send(client, [0, 1, 2, 3, 4], [290.0, 301.0, 290.0, 301.0, 302.5])
+    (yellow,) = alarms(client, 1)
+    assert (yellow["channel"], yellow["colour"], yellow["side"], yellow["limit"]) == ("T_px", "yellow", "high", 300.0)
+    assert (yellow["on"], yellow["start"], yellow["stop"]) == ("measured", "1970-01-01T00:00:03Z", None)
+    assert (yellow["worst"], yellow["unit"]) == (302.5, "K")
+    assert yellow["message"] == "T_px is above its yellow limit of 300 K: 302.5 at worst"
+    send(client, [5, 6, 7, 8], [311.0, 312.0, 299.8, 299.9])  # within the dead band of 3 noises, 0.3 K
+    yellow, red = alarms(client, 2)  # what lasts comes first
+    assert (yellow["stop"], red["start"]) == (None, "1970-01-01T00:00:05Z")
+    assert {row["colour"]: row["stop"] for row in (red, yellow)} == {"yellow": None, "red": "1970-01-01T00:00:07Z"}
+    send(client, [9, 10], [299.0, 299.0])
+    alarms(client, 1, colour="yellow", stop="1970-01-01T00:00:09Z")
+    told = [m["alarm"] for m in messages(client) if m["type"] == "alarm"]
+    assert [(row["colour"], row["stop"] is None) for row in told] == [
+        ("yellow", True),
+        ("red", False),
+        ("yellow", False),
+    ]
+
+
+def test_each_side_and_each_kind_of_channel(client: AppClient) -> None:
+    send(client, [0, 1], [265.0, 264.0], T_tank=[41.0, 42.0], Q_px=[150.0, 150.0])
+    rows = alarms(client, 4)
+    assert {(row["channel"], row["colour"], row["side"], row["unit"]) for row in rows} == {
+        ("T_px", "yellow", "low", "K"),
+        ("T_px", "red", "low", "K"),
+        ("T_tank", "yellow", "high", "degC"),
+        ("Q_px", "red", "high", "W"),
+    }
+    assert [row["colour"] for row in rows] == ["red", "red", "yellow", "yellow"]
+    text = client.get("/metrics").text
+    assert 'twin_open_alarms{colour="red",twin="benchsat"} 2.0' in text
+
+
+def test_markers_of_missing_samples_and_late_samples_raise_nothing(client: AppClient) -> None:
+    send(client, [0, 1, 2, 3], [290.0, -999.0, -999.0, 290.0], T_tank=[41.0] * 4)
+    alarms(client, 1, channel="T_tank")
+    send(client, [0.2, 0.4], [320.0, 320.0])  # of the past
+    send(client, [10, 11], [290.0, 290.0], T_tank=[41.0] * 2, Q_px=[150.0, 150.0])
+    alarms(client, 1, channel="Q_px")
+    assert {row["channel"] for row in alarms(client, 2)} == {"T_tank", "Q_px"}
+
+
+def test_an_alarm_survives_a_restart_as_one(make_client) -> None:
+    first = make_client(workbench=Warming)
+    first.post("/v1/twins", json=LIMITED)
+    send(first, [0, 1], [301.0, 301.0])
+    (before,) = alarms(first, 1)
+    first.close()
+    again = make_client(workbench=Warming)
+    send(again, [2, 3, 4], [303.0, 290.0, 290.0])
+    (after,) = alarms(again, 1, stop="1970-01-01T00:00:03Z")
+    assert (after["id"], after["start"], after["worst"]) == (before["id"], before["start"], 303.0)
+
+
+def test_acknowledging_and_shelving(client: AppClient) -> None:
+    send(client, [0, 1], [301.0, 301.0])
+    (alarm,) = alarms(client, 1)
+    seen = client.post(f"{TWIN}/alarms/{alarm['id']}/acknowledge", json={"note": "heater test"}).json()
+    assert seen["acknowledged"]["note"] == "heater test" and seen["stop"] is None
+    send(client, [2, 3], [311.0, 311.0])
+    red, yellow = alarms(client, 2)
+    assert (red["colour"], red["acknowledged"]) == ("red", None) and yellow["acknowledged"] is not None
+    shelved = client.post(f"{TWIN}/alarms/{red['id']}/shelve", json={"for_s": 3600}).json()
+    assert shelved["shelved_until"] is not None
+    assert [row["colour"] for row in alarms(client, 2)] == ["yellow", "red"]  # what is shelved comes later
+    assert 'twin_open_alarms{colour="red",twin="benchsat"} 0.0' in client.get("/metrics").text
+
+    before = len([m for m in messages(client) if m["type"] == "alarm"])
+    send(client, [4, 5, 6, 7], [305.0, 305.0, 312.0, 312.0])  # it ends and comes again: nobody wants to hear of it
+    (_, new) = alarms(client, 2, colour="red")
+    assert all(row["shelved_until"] == shelved["shelved_until"] for row in (_, new))
+    assert len([m for m in messages(client) if m["type"] == "alarm"]) == before
+    taken_up = client.post(f"{TWIN}/alarms/{new['id']}/shelve", json={"for_s": 0}).json()
+    assert taken_up["shelved_until"] is None
+    assert 'twin_open_alarms{colour="red",twin="benchsat"} 1.0' in client.get("/metrics").text
+
+
+def calibrate(client: AppClient) -> None:
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+
+
+def test_a_forecast_says_when_a_limit_is_reached(client: AppClient) -> None:
+    """At 290 K and 0.01 K/s, 300 K are reached after 1000 s; 4 K of spread are 400 s on both sides."""
+    send(client, [float(k) for k in range(100)], [290.0] * 100)
+    calibrate(client)
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 3600, "step_s": 60}).json()
+    yellow, red = found["limits"]
+    assert (yellow["channel"], yellow["colour"], yellow["limit"]) == ("T_px", "yellow", 300.0)
+    assert yellow["message"] == "T_px reaches its yellow limit of 300 K in 16 min 40 s (90 %: 10 min to 23 min 20 s)"
+    times = [yellow[name] for name in ("earliest", "expected", "latest")]
+    assert times == ["1970-01-01T00:11:39Z", "1970-01-01T00:18:19Z", "1970-01-01T00:24:59Z"]
+    assert red["message"].startswith("T_px reaches its red limit of 310 K in 33 min 20 s")
+    assert set(found["values"]["T_px"]) == {"mean", "q05", "q50", "q95"}
+    near = client.get(f"{TWIN}/forecast", params={"horizon_s": 900, "step_s": 60}).json()["limits"]
+    assert [row["message"] for row in near] == ["T_px may reach its yellow limit of 300 K in 10 min at the earliest"]
+    assert near[0]["expected"] is None
+
+
+def test_a_forecast_alarm_gives_way_to_the_measured_one(client: AppClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.live.limits.FORECAST_EVERY_S", 0.1)
+    send(client, [float(k) for k in range(100)], [290.0] * 100)
+    calibrate(client)
+    send(client, [100.0], [290.0])
+    red, yellow = alarms(client, 2, on="forecast", stop=None)
+    assert (red["colour"], yellow["colour"]) == ("red", "yellow")
+    assert "reaches its yellow limit of 300 K in 16 min 40 s" in yellow["message"]
+    assert yellow["expected"] == "1970-01-01T00:18:20Z"
+    send(client, [101.0, 102.0], [301.0, 301.0])
+    (measured,) = alarms(client, 1, on="measured")
+    (ended,) = alarms(client, 1, on="forecast", stop="1970-01-01T00:01:42Z")
+    assert (measured["colour"], ended["colour"]) == ("yellow", "yellow")
+    alarms(client, 1, on="forecast", colour="red", stop=None)
+
+
+def test_a_deletion_takes_its_alarms_along(client: AppClient) -> None:
+    send(client, [0, 1, 2, 3], [290.0, 340.0, 340.0, 290.0])
+    alarms(client, 2)
+    client.request("DELETE", f"{TWIN}/telemetry", params={"start": 1, "stop": 3})
+    alarms(client, 0)
+    send(client, [4, 5], [301.0, 301.0])
+    (left,) = alarms(client, 1)
+    assert left["start"] == "1970-01-01T00:00:04Z"
+
+
+WRONG = (
+    ("9/acknowledge", {}, 404),
+    ("9/shelve", {"for_s": 1}, 404),
+    ("1/shelve", {}, 422),
+    ("1/shelve", {"for_s": -1}, 422),
+)
+
+
+@pytest.mark.parametrize(("path", "body", "status"), WRONG)
+def test_wrong_requests(client: AppClient, path: str, body: dict, status: int) -> None:
+    send(client, [0, 1], [301.0, 301.0])
+    alarms(client, 1)
+    assert client.post(f"{TWIN}/alarms/{path}", json=body).status_code == status
