@@ -35,6 +35,12 @@ LARGEST_STEP = 1.5
 START_SHARES = (1.0, 0.03)
 """Sizes of the latent heat that a fit starts from, as shares of a typical one."""
 
+STEP_SHARES = (1.0, 0.3, 0.1)
+"""Shares of a step of the parameters that are tried in turn."""
+
+MOST_REFUSED = 2
+"""So many passes in which no step of the parameters helped, and only the latent heat is sized on."""
+
 LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
 
@@ -163,9 +169,11 @@ def fit_with_latent_heat(
 
 def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int, resized: Sequence[int] | None = None) -> HeatFit:
     """Take passes until the likelihood no longer grows."""
+    refused = 0
     for _ in range(n_passes):
-        before = fit.log_likelihood
-        fit = _pass(fit, sizes, np.inf, resized=resized)
+        before, free = fit.log_likelihood, fit.free
+        fit = _pass(fit, sizes, np.inf, resized=resized, still=refused >= MOST_REFUSED)
+        refused = refused + 1 if np.array_equal(free, fit.free) else 0
         small = (sizes.log_step[list(sizes.positions(resized))] < SETTLED_LOG_STEP).all()
         if fit.log_likelihood - before < SETTLED_NATS and small:
             break
@@ -173,13 +181,21 @@ def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int, resized: Sequence[in
 
 
 def _pass(
-    fit: HeatFit, sizes: SizeSearch, leash: float, *, smoothing: bool = False, resized: Sequence[int] | None = None
+    fit: HeatFit,
+    sizes: SizeSearch,
+    leash: float,
+    *,
+    smoothing: bool = False,
+    resized: Sequence[int] | None = None,
+    still: bool = False,
 ) -> HeatFit:
-    """Relinearise about smoothed temperatures where asked, then improve parameters, then the latent heat's size."""
+    """Relinearise about smoothed temperatures where asked, improve parameters but for ``still``, then the heat's size."""
     problem, nominals = fit.problem, fit.nominals
     if smoothing:
         nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
-    free, latent, nominals = _improve(problem, fit.free, fit.latent, nominals, leash)
+    free, latent = fit.free, fit.latent
+    if not still:
+        free, latent, nominals = _improve(problem, free, latent, nominals, leash)
     latent, value = sizes.improve(problem, latent, nominals, resized)
     return HeatFit(problem, free, latent, nominals, value)
 
@@ -209,15 +225,14 @@ def _improve(
         step, hessian = gauss_newton_step(problem, free, latent, nominals, leash)
         if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
             return free, latent, tuple(nominals)
-    for _ in range(5):
-        trial = free + step
+    for share in STEP_SHARES:
+        trial = free + share * step
         values = parameters.to_values(trial)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
             size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
             better = posterior(trial, size, about) > before
         if better:
             return trial, size, about
-        step = 0.35 * step
     return free, latent, tuple(nominals)
 
 
