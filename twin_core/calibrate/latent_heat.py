@@ -178,6 +178,12 @@ def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nomi
     return total if np.isfinite(total) else -np.inf
 
 
+def gain_of_latent_heat(fit: HeatFit) -> float:
+    """Return the log-likelihood that undeclared heat adds to a fit, in nats: next to nothing where nothing is missing."""
+    none = LatentHeat(np.full_like(fit.latent.std_W, NO_HEAT_W), fit.latent.length_s)
+    return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
+
+
 def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:
     """Return the linear response of the readings to the free parameters, (n_samples, n_sensors, n_free).
 

@@ -13,7 +13,6 @@ from twin_core.calibrate.covariance import gls_covariance
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.latent_size import first_size
-from twin_core.calibrate.lumping import log_likelihood_beside_lumping
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
@@ -101,11 +100,6 @@ class Trial:
         """Misfit over noise, rms over sensors: how much the open-loop model leaves beyond the sensors' own noise."""
         models, noise = self.calibration.whitener.models, self.calibration.problem.noise_K
         return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
-
-    @cached_property
-    def log_evidence(self) -> float:
-        """Log-likelihood with what a lumped network cannot follow integrated out, less what the priors hold against it."""
-        return log_likelihood_beside_lumping(self.fit) + self.fit.log_prior
 
     @property
     def excess(self) -> float:
@@ -375,7 +369,7 @@ class Validation:
 
 def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return what the likelihood in the presence of latent heat says for the rich trial, chosen among ``n_tried``."""
-    return _evidence(rich.log_evidence - simple.log_evidence, simple, rich, n_tried)
+    return _evidence(rich.fit.log_posterior - simple.fit.log_posterior, simple, rich, n_tried)
 
 
 def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:

@@ -63,6 +63,11 @@ class Finding:
         """The effects, at the values of the trial that found them."""
         return self.judged.effects
 
+    @property
+    def foresight(self) -> float:
+        """Error on what they were not fitted to, after over before."""
+        return 1.0 if self.judged.validation is None else self.judged.validation.foresight
+
     def without(self, place: object, worth_of_it: float, trial: Trial) -> "Finding":
         """Return the finding without its effect at a place, whose log Bayes factor was ``worth_of_it``, if it has one."""
         kept = tuple(effect for effect in self.effects if effect.place != place)
@@ -101,6 +106,15 @@ class Search:
     rejected: list[Judged] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+
+    def fork(self) -> "Search":
+        """Return a search that starts from here and shares what failed or was left out."""
+        return replace(self, findings=list(self.findings), rejected=list(self.rejected))
+
+    def join(self, fork: "Search") -> None:
+        """Go on from where a fork has come to."""
+        self.trial, self.findings, self.rejected = fork.trial, fork.findings, fork.rejected
+        self.n_named = max(self.n_named, fork.n_named)
 
     def attempt(self, work: Callable[[], T], what: str) -> T | None:
         """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``."""

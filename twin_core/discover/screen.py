@@ -12,7 +12,6 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
-from twin_core.calibrate.lumping import lumping_shapes
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
@@ -167,12 +166,9 @@ def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
 def _nuisance(fit: HeatFit, blocks: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     parameters = fit.problem.network.parameters
     std = parameters.prior_std
-    shapes = lumping_shapes(fit.problem)
-    columns = [np.concatenate(both, axis=2) for both in zip(blocks, shapes, strict=True)]
-    prior = np.diag(np.concatenate([1.0 / std, np.ones(shapes[0].shape[2])]))
-    design = np.vstack([_whitened(fit, columns), prior])
+    design = np.vstack([_whitened(fit, blocks), np.diag(1.0 / std)])
     data = _whitened(fit, [n.residual_K[:, :, None] for n in fit.nominals])[:, 0]
-    rows = np.concatenate([data, (parameters.free - fit.free) / std, np.zeros(shapes[0].shape[2])])
+    rows = np.concatenate([data, (parameters.free - fit.free) / std])
     scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
     left, singular, _ = np.linalg.svd(design / scale, full_matrices=False)
     basis = left[:, singular > 1e-10 * singular[0]] if singular.size else left

@@ -11,7 +11,7 @@ import numpy as np
 
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
-from twin_core.calibrate.lumping import gain_of_latent_heat
+from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
 from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
@@ -32,6 +32,9 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
+
+DOUBTFUL = 0.8
+"""Foresight from which a finding of the innovations is held against what open-loop residuals suggest: the better one counts."""
 
 LEAST_EXCESS = 0.1
 """Part of the variance of open-loop residuals that must be beyond the noise, at one sensor at least: else nothing is missing."""
@@ -85,10 +88,20 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
-    if state.attempt(partial(_extend_by_heat, state, needed, fallback=fallback), f"{what}, by what the filter leaves"):
+    by_heat, by_trajectory = state.fork(), state.fork()
+    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
+    told = state.attempt(first, f"{what}, by what the filter leaves")
+    if told and by_heat.findings[-1].foresight < DOUBTFUL:
+        state.join(by_heat)
         return True
-    second = partial(extend_by_trajectory, state, needed, fallback=fallback)
-    return bool(state.attempt(second, f"{what}, by open-loop residuals"))
+    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback)
+    seen = state.attempt(second, f"{what}, by open-loop residuals")
+    options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
+    if not options:
+        state.rejected = by_trajectory.rejected + by_heat.rejected[len(state.rejected) :]
+        return False
+    state.join(min(options, key=lambda fork: fork.findings[-1].foresight))
+    return True
 
 
 def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:

@@ -15,7 +15,6 @@ from twin_core.discover.confirm import (
     about_trajectory,
     resettled,
     try_on_trajectories,
-    weigh,
     weigh_trajectories,
 )
 from twin_core.discover.judge import Judged, Search, accept, is_close, once_each
@@ -91,8 +90,11 @@ def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged 
 
 
 def _supported(state: Search, options: Sequence[Judged], needed: float) -> list[Judged]:
-    """Return the options that the innovations support as well, with their parameters fitted to these."""
+    """Return the options that the innovations make likelier too, with their parameters fitted to these.
+
+    The freedom of an option has been paid for where it was chosen, on trajectories.
+    """
     likely = [j for j in options if j.evidence.log_bayes_factor > needed]
     trials = [state.attempt(partial(resettled, state.trial, j.trial), f"{j.labels} on trajectories") for j in likely]
     settled = [replace(j, trial=trial) for j, trial in zip(likely, trials, strict=True) if trial is not None]
-    return [j for j in settled if weigh(state.trial, j.trial, 1).log_bayes_factor > needed]
+    return [j for j in settled if j.trial.fit.log_posterior - state.trial.fit.log_posterior > needed]

@@ -110,7 +110,7 @@ def test_the_right_effect_is_fitted_and_supported(trials: tuple[Trial, Trial]) -
 def test_evidence_pays_for_parameters_and_candidates(trials: tuple[Trial, Trial]) -> None:
     """Schwarz: half ln n per parameter; ln m for m candidates; the p-value after Wilks and Bonferroni."""
     base, right = trials
-    gain = right.log_evidence - base.log_evidence
+    gain = right.fit.log_posterior - base.fit.log_posterior
     for tried in (1, 40):
         evidence = weigh(base, right, tried)
         assert evidence.log_bayes_factor == pytest.approx(gain - 0.5 * np.log(400) - np.log(tried))
