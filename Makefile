@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 
-.PHONY: demo test test-fast check bench bench-paper-a bench-paper-b bench-loop bench-service serve clean
+.PHONY: demo test test-fast check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -37,6 +37,9 @@ check: $(STAMP)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
+
+bench-measured: $(STAMP)
+	$(BIN)/python -m benchmarks.measured_sets
 
 bench-paper-a: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_a

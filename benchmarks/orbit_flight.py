@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.markdown import markdown_table, save_table
-from benchmarks.measured_sets import DATA, ROOT
+from benchmarks.measured_splits import DATA, ROOT
 from twin_core._typing import FloatArray
 from twin_core.calibrate import CalibratedModel, calibrate
 from twin_core.discover.holdout import predict, split_fraction

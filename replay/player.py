@@ -26,6 +26,7 @@ class Tally:
     duplicates: int = 0
     rejected: int = 0
     last_time: str | None = None
+    quarantined: int = 0
 
 
 def no_tally(tally: Tally) -> None:
@@ -94,6 +95,7 @@ def _send_all(
             tally.duplicates + report.duplicates,
             tally.rejected + len(report.rejected),
             report.last_time,
+            tally.quarantined + len(report.quarantined),
         )
         progress(tally)
     return tally

@@ -108,4 +108,20 @@ def anomalies(name: str, parameters: Parameters) -> Call[schemas.AnomalyList]:
     return Call("GET", f"/v1/twins/{name}/anomalies", schemas.AnomalyList, parameters=parameters)
 
 
+def delete_telemetry(name: str, parameters: Parameters) -> Call[schemas.Deletion]:
+    """Take a part of the archive out."""
+    path = f"/v1/twins/{name}/telemetry"
+    return Call("DELETE", path, schemas.Deletion, parameters=parameters, repeatable=False)
+
+
+def undo_deletion(name: str, deletion: int) -> Call[schemas.Deletion]:
+    """Put back what a deletion took."""
+    return Call("POST", f"/v1/twins/{name}/telemetry/deletions/{deletion}/undo", schemas.Deletion, repeatable=False)
+
+
+def alarms(name: str) -> Call[schemas.AlarmList]:
+    """List the alarms of limits."""
+    return Call("GET", f"/v1/twins/{name}/alarms", schemas.AlarmList)
+
+
 _ROOM: dict[schemas.JobKind, str] = {"calibration": "calibrations", "diagnosis": "diagnoses"}

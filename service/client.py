@@ -243,6 +243,26 @@ class TwinClient:
         """Return anomalies between ``start`` and ``stop``."""
         return self.send(calls.anomalies(name, parameters)).anomalies
 
+    def alarms(self, name: str) -> list[schemas.Alarm]:
+        """Return the alarms of limits, those first that last and are not shelved."""
+        return self.send(calls.alarms(name)).alarms
+
+    def delete_telemetry(
+        self,
+        name: str,
+        *,
+        start: str | float | None = None,
+        stop: str | float | None = None,
+        channels: Sequence[str] | None = None,
+    ) -> schemas.Deletion:
+        """Delete start <= time < stop, or the values of some channels there; ``undo_deletion`` puts it back for a day."""
+        named = ",".join(channels) if channels is not None else None
+        return self.send(calls.delete_telemetry(name, {"start": start, "stop": stop, "channels": named}))
+
+    def undo_deletion(self, name: str, deletion: int) -> schemas.Deletion:
+        """Put back what a deletion took."""
+        return self.send(calls.undo_deletion(name, deletion))
+
     def events(self, name: str, after_seq: int | None = None) -> Iterator[schemas.Message]:
         """Yield the messages of the stream until the service ends it; Unreachable if the connection is lost."""
         parameters = {} if after_seq is None else {"after_seq": after_seq}

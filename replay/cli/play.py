@@ -39,7 +39,8 @@ def replay(
 ) -> int:
     """Stream recordings into a running service, paced or as fast as it takes them.
 
-    Exits with 1 if the service refused samples, because it holds others of the same time.
+    Exits with 1 if the service refused samples, because it holds others of the same time, or put some into quarantine,
+    because they lie ahead of its clock.
     """
     from replay.cli.console import print_line, to_json
     from replay.source import load
@@ -51,13 +52,13 @@ def replay(
     recordings = load(files)
     with TwinClient(url, key) as client:
         tallies = [_send(r, client, twin, wanted, pace, resume) for r in recordings]
-    outcome = {
-        name: sum(getattr(tally, name) for tally in tallies) for name in ("sent", "accepted", "duplicates", "rejected")
-    } | {"last_time": tallies[-1].last_time}
+    counted = ("sent", "accepted", "duplicates", "rejected", "quarantined")
+    outcome = {name: sum(getattr(tally, name) for tally in tallies) for name in counted}
+    outcome |= {"last_time": tallies[-1].last_time}
     print_line(
         to_json(outcome).rstrip() if as_json else ", ".join(f"{name} {value}" for name, value in outcome.items())
     )
-    return 1 if outcome["rejected"] else 0
+    return 1 if outcome["rejected"] or outcome["quarantined"] else 0
 
 
 def _pace(rate: str) -> float | None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.measured_sets import DATA, ROOT
+from benchmarks.measured_splits import DATA, ROOT
 from benchmarks.orbit_flight import FILE, crossings, fit_and_predict, live_rows, rmse_K
 from twin_core.network.spec_io import load_spec
 

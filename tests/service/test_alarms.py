@@ -2,6 +2,7 @@
 
 import copy
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from service.workbench import Forecasted, ForecastTask
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
+from tests.service.server import FAKE, Server
 from tests.service.test_live import messages
 
 TWIN = "/v1/twins/benchsat"
@@ -198,3 +200,18 @@ def test_wrong_requests(client: AppClient, path: str, body: dict, status: int) -
     send(client, [0, 1], [301.0, 301.0])
     alarms(client, 1)
     assert client.post(f"{TWIN}/alarms/{path}", json=body).status_code == status
+
+
+@pytest.mark.e2e
+def test_the_python_client_speaks_of_alarms_and_deletions(tmp_path: Path) -> None:
+    with Server(tmp_path, command=FAKE) as server:
+        client = server.client()
+        client.register(LIMITED)
+        client.ingest("benchsat", [0, 1, 2], {"T_px": [290.0, 301.0, 302.0]})
+        while not (found := client.alarms("benchsat")):
+            time.sleep(0.05)
+        assert (found[0].channel, found[0].limit) == ("T_px", 300.0)
+        made = client.delete_telemetry("benchsat", start=1, channels=["T_px"])
+        assert made.samples == 2 and client.archive("benchsat").values["T_px"] == [290.0, None, None]
+        client.undo_deletion("benchsat", made.id)
+        assert client.archive("benchsat").values["T_px"] == [290.0, 301.0, 302.0]

@@ -65,6 +65,15 @@ def test_conflicts_are_the_answer_no(url: str, tmp_path: Path, capsys: pytest.Ca
     assert code == 1 and outcome["rejected"] == 5
 
 
+def test_samples_ahead_of_the_services_clock_are_told(
+    url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run(capsys, url, record(tmp_path / "a.mcap", range(40)))
+    century = 100 * 365 * 24 * 60
+    code, outcome = run(capsys, url, record(tmp_path / "b.mcap", range(century, century + 3), warmer_K=-century * 0.6))
+    assert code == 1 and (outcome["accepted"], outcome["quarantined"]) == (0, 3)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
