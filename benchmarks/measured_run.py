@@ -106,6 +106,11 @@ class Result:
         """Whether the corrected model predicts the hold-out worse than the declared one."""
         return self.after_K > WORSE * self.before_K
 
+    def holds_for(self, deadline_s: float) -> bool:
+        """Whether a run with this deadline would have come to the same: a search that ended in time needs no more."""
+        in_time = not self.hung and not self.at_deadline and self.seconds <= min(self.deadline_s, deadline_s)
+        return self.deadline_s == deadline_s or in_time
+
     @property
     def crashed(self) -> bool:
         """Whether it ended with an error of its own."""
@@ -138,12 +143,12 @@ def sources() -> str:
 
 
 def cached(path: Path | None, code: str, deadline_s: float) -> dict[str, Result]:
-    """Return the results in a file of JSON lines that hold for this code and deadline, by name."""
+    """Return the results in a file of JSON lines that hold for this code and deadline, by name; the last one counts."""
     if path is None or not path.exists():
         return {}
     lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
     results = [from_line(line) for line in lines]
-    return {r.name: r for r in results if (r.code, r.deadline_s) == (code, deadline_s)}
+    return {r.name: r for r in results if r.code == code and r.holds_for(deadline_s)}
 
 
 def _one_line(error: BaseException) -> str:

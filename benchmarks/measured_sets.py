@@ -2,9 +2,9 @@
 
 ``python -m benchmarks.measured_sets [--data DIR] [--only SUBSTRING ...] [--deadline S] [--cache FILE] [--fresh]
 [--processes N]`` runs every split in a process of its own and saves ``benchmarks/tables/measured_sets.md``. A run that fails,
-dies or hangs is a row. Finished runs stand in the cache and are run again only where the code or the deadline differs. With
-``--only`` the tables of these splits are printed and nothing is saved. The data are not part of the repository: sets that are
-absent are left out with a reason.
+dies or hangs is a row. Finished runs stand in the cache; they are run again where the code differs, or where a deadline cut
+them and another one is given. With ``--only`` the tables of these splits are printed and nothing is saved. The data are not
+part of the repository: sets that are absent are left out with a reason.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def present(splits: Sequence[Split], data: Path) -> list[Split]:
     return there
 
 
-def page(results: Sequence[Result], splits: Sequence[Split], data: Path) -> str:
+def page(results: Sequence[Result], splits: Sequence[Split], data: Path, deadline_s: float) -> str:
     """Return every table and the summary as markdown, in the order of the splits."""
     by_name = {result.name: result for result in results}
     ordered = [by_name[split.name] for split in splits]
@@ -52,7 +52,7 @@ def page(results: Sequence[Result], splits: Sequence[Split], data: Path) -> str:
     single = {split.name for split in splits if split.every_pair}
     sets, runs = ([r for r in ordered if (r.name in single) == alone] for alone in (False, True))
     parts = [
-        *((main_table(sets, others), LEGEND) if sets else ()),
+        *((main_table(sets, others), LEGEND, f"Each search had a deadline of {deadline_s:g} s.") if sets else ()),
         "## Figures to reach",
         figures_table(ordered),
         *((RUNS_TITLE, RUNS_WORDS, main_table(runs, others), PAIRS_WORDS, pairs_table(runs)) if runs else ()),
@@ -88,7 +88,7 @@ def main(words: Sequence[str] | None = None) -> None:
     ):
         results.append(result)
         print(in_one_line(result), flush=True)
-    text = page(results, splits, given.data)
+    text = page(results, splits, given.data, given.deadline)
     if not given.only:
         save_table("measured_sets", TITLE, text, "benchmarks.measured_sets")
     print(text)

@@ -97,10 +97,14 @@ def test_a_result_survives_the_cache(result: Result) -> None:
 
 def test_the_cache_holds_for_one_code_and_one_deadline(tmp_path: Path) -> None:
     path = tmp_path / "results.jsonl"
-    other, longer = replace(WORSE, code="def"), replace(PAIRED, deadline_s=300.0)
-    path.write_text("".join(to_line(r) + "\n" for r in (GOOD, other, longer, replace(GOOD, verdict="unexplained"))))
+    other, longer = replace(WORSE, code="def"), replace(PAIRED, deadline_s=300.0, seconds=100.0)
+    rows = (GOOD, other, longer, replace(GOOD, verdict="unexplained"), CRASHED, replace(WORSE, name="cut"))
+    path.write_text("".join(to_line(row) + "\n" for row in rows))
     known = cached(path, "abc", 60.0)
-    assert set(known) == {GOOD.name} and known[GOOD.name].verdict == "unexplained"
+    assert set(known) == {GOOD.name, CRASHED.name, "cut"} and known[GOOD.name].verdict == "unexplained"
+    # A search that ended in time needs no more of it; one that was cut might have gone on.
+    assert set(cached(path, "abc", 300.0)) == {GOOD.name, CRASHED.name, PAIRED.name}
+    assert set(cached(path, "abc", 10.0)) == {CRASHED.name}
     assert cached(path, "xyz", 60.0) == cached(tmp_path / "none", "abc", 60.0) == cached(None, "abc", 60.0) == {}
 
 
