@@ -100,6 +100,7 @@ def test_alarms_are_acknowledged_and_shelved(server: Server, page: Browser) -> N
     server.client().register({**SPEC, "channels": limited})
     server.client().ingest("benchsat", [9000, 9001, 9002], {"T_px": [290.0, 296.0, 297.0]})
     page.until("document.getElementById('alarms').innerText.includes('above its yellow limit of 295 K')")
+    page.until("document.querySelector('#now .state.warn').title === 'above its yellow limit'")
     page.click("#alarms button:first-of-type")
     page.until("document.getElementById('alarms').innerText.includes('acknowledged')")
     page.click("#alarms button:last-of-type")

@@ -162,8 +162,8 @@ function renderNow() {
   // A sensor behaves as expected only where something was expected: until a residual exists nobody knows.
   const has_residual = (name) => state.residuals !== null && state.residuals.residual_K[name].some((v) => v !== null);
   const doubt = (name) => (state.detail.active_model === null ? standing() : has_residual(name) ? "" : underWay() || "no residual yet");
-  const unit = unitShown(), { latest, ahead, anomalies } = state;
-  drawNow($("now"), { sensors: sensors(), units: units(), latest, ahead: ahead && ahead.values, unit, anomalies, doubt, telemetry: state.detail.telemetry });
+  const unit = unitShown(), { latest, ahead, anomalies, alarms } = state;
+  drawNow($("now"), { sensors: sensors(), units: units(), latest, ahead: ahead && ahead.values, unit, anomalies, alarms, doubt, telemetry: state.detail.telemetry });
   $("now-note").textContent = ahead ? `${unitName(unit)}, expected in ${span(seconds(ahead.time.at(-1)) - seconds(ahead.from))}` : unitName(unit);
 }
 

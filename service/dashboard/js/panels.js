@@ -3,12 +3,14 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, doubt, telemetry }) {
+export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, alarms, doubt, telemetry }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
   const show = (value, from) => number(toUnit(value, from, unit), 2);
   const SIGNS = { stuck: "frozen", quantised: "repeats itself", dropout: "does not report" };
   const silent = ({ state, age_s, signs }) => (state === "stale" ? `silent${age_s === null ? "" : ` for ${span(age_s)}`}` : signs.map((kind) => SIGNS[kind]).join(", "));
-  const look = (name) => (silent(telemetry[name]) ? ["state warn", silent(telemetry[name])] : open.has(name) ? ["state bad", "anomaly"] : doubt(name) ? ["state unknown", doubt(name)] : ["state", "as expected"]);
+  const beyond = (name) => alarms.find((a) => a.channel === name && a.on === "measured" && a.stop === null && !a.shelved_until);
+  const limited = ({ colour, side }) => [`state ${colour === "red" ? "bad" : "warn"}`, `${side === "high" ? "above" : "below"} its ${colour} limit`];
+  const look = (name) => (beyond(name) ? limited(beyond(name)) : silent(telemetry[name]) ? ["state warn", silent(telemetry[name])] : open.has(name) ? ["state bad", "anomaly"] : doubt(name) ? ["state unknown", doubt(name)] : ["state", "as expected"]);
   const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
   const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {

@@ -1,0 +1,54 @@
+"""A file of an earlier release is brought up to date where it stands."""
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pytest
+
+from service.store import migrations
+from tests.service.conftest import SPEC
+
+TWIN = "/v1/twins/benchsat"
+
+
+@pytest.fixture
+def old_file(tmp_path: Path) -> Path:
+    """A file from before receive times, deletions and limits, with twenty samples in one chunk."""
+    path = tmp_path / "twin.sqlite3"
+    connection = sqlite3.connect(path, isolation_level=None)
+    connection.execute("CREATE TABLE migration (name TEXT PRIMARY KEY, at TEXT DEFAULT CURRENT_TIMESTAMP)")
+    for name, step in migrations.STEPS[: [name for name, _ in migrations.STEPS].index("clocks")]:
+        step(connection)
+        connection.execute("INSERT INTO migration (name) VALUES (?)", (name,))
+    text = orjson.dumps(SPEC).decode()
+    connection.execute("INSERT INTO twin (name, specification, created_us) VALUES ('benchsat', ?, 0)", (text,))
+    connection.execute("INSERT INTO head VALUES (1, 20, 20, 0, 19000000, 1, 20)")
+    time_us, values = np.arange(20, dtype="<i8") * 1_000_000, np.full((3, 20), 290.0)
+    values[1:] = 15.0
+    connection.execute(
+        "INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value) VALUES (1, 20, 0, 19000000, 20, ?, ?, ?)",
+        (np.arange(1, 21, dtype="<i8").tobytes(), time_us.tobytes(), values.tobytes()),
+    )
+    connection.close()
+    return path
+
+
+def test_an_old_archive_is_read_written_deleted_and_compacted(old_file: Path, make_client: Any) -> None:
+    client = make_client()
+    detail = client.get(TWIN).json()
+    assert (detail["samples"], detail["quarantined"], detail["telemetry"]["T_px"]["state"]) == (20, 0, "stale")
+    made = client.request("DELETE", f"{TWIN}/telemetry", params={"start": 5, "stop": 8}).json()
+    assert made["samples"] == 3
+    client.post(f"{TWIN}/telemetry/deletions/{made['id']}/undo")
+    for k in range(20, 120):  # enough small chunks to be compacted with those of before
+        body = {"time": [k], "values": {"T_px": [290.0], "T_tank": [15.0], "Q_px": [15.0]}}
+        assert client.post(f"{TWIN}/telemetry", json=body).json()["accepted"] == 1
+    archive = client.get(f"{TWIN}/telemetry").json()
+    assert archive["samples"] == len(set(archive["time"])) == 120
+    assert archive["values"]["T_px"] == [290.0] * 120
+    client.close()
+    with sqlite3.connect(old_file) as connection:
+        assert connection.execute("SELECT count(*) FROM chunk").fetchone()[0] < 64
