@@ -14,6 +14,7 @@ from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
 from replay.cli.forecast import forecast
+from replay.cli.import_model import import_model
 from replay.cli.play import replay
 from replay.cli.record import record
 from replay.cli.serve import serve
@@ -38,7 +39,7 @@ def twin(traceback: bool) -> None:
     """
 
 
-for command in (demo, serve, simulate, replay, record, calibrate, forecast, close_loop, check_effect):
+for command in (demo, serve, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect):
     twin.add_command(command)
 
 

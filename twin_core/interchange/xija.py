@@ -50,7 +50,6 @@ HRC_S = -86147.0
 _POWER_STATES = ("0xxx", "1xxx", "2xxx", "3xx0", "3xx1", "4xxx", "5xxx", "66x0", "6611", "6xxx")
 
 
-
 @dataclass(frozen=True)
 class Component:
     """One component of a model: its class, name, arguments by name, parameters by name, and the line where it stands."""
@@ -261,6 +260,10 @@ def read_xija(
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             write.refused.append(f"{write.at(component)} cannot be read ({type(error).__name__}: {error})")
     _couple(write, components)
+    read = {*write.channels, *write.derived}
+    for c in components:
+        if c.kind == "CmdStatesData" and write.measured.get(c.name, name_of(c.name, "_")) not in read:
+            write.notes.append(f"{write.at(c)} is read by nothing and left out")
     return Imported(_document(write, model), tuple(write.notes), tuple(write.refused), _starts(components))
 
 
@@ -381,11 +384,8 @@ def _limits(told: Mapping[str, Any]) -> Data:
     return {"limits": found} if found else {}
 
 
-def _channel(name: str | None, *, levels: bool) -> Callable[[_Writer, Component], None]:
-    def translate(write: _Writer, component: Component) -> None:
-        write.channel(name or str(component.args["msid"]), levels=levels)
-
-    return translate
+def _input(write: _Writer, component: Component) -> None:
+    """Declared by what reads it."""
 
 
 def _sunlit(write: _Writer, component: Component) -> str | None:
@@ -435,7 +435,13 @@ def _solar(write: _Writer, component: Component) -> None:
             write.notes.append(f"{write.at(component)}: ampl is held, not calibrated")
     elif ampl:
         write.power(component, node, ampl, " * ".join([*times, _season()]), "ampl")
-    factor = lit if len(times) < 2 and lit else write.formula(f"{component.name}_season", " * ".join(times)) if times else None
+    factor = (
+        lit
+        if len(times) < 2 and lit
+        else write.formula(f"{component.name}_season", " * ".join(times))
+        if times
+        else None
+    )
     knots, aged = _pitches(component), _pitches(component, "dP_pitches")
     bias = component.par("bias")
     values, names = _values(component, "P", knots)
@@ -485,7 +491,11 @@ def _solar_by_instrument(write: _Writer, component: Component) -> None:
     changes, names = _values(component, "dP", aged)
     _aged(write, component, node, pitch, aged, changes, [], names)
     write.power(component, node, component.par("ampl", 0.05), _season(), "ampl")
-    heater = write.channel(str(args.get("dh_heater_comp") or "dh_heater"), levels=True)
+    name = str(args.get("dh_heater_comp") or "dh_heater")
+    if write.constant.get(name) == 0.0:
+        write.notes.append(f"{write.at(component)}: {name} is always 0; its heat is left out")
+        return
+    heater = write.channel(name, levels=True)
     write.power(component, node, component.par("dh_heater", 0.05), f"1.0 * {heater}", "dh_heater")
 
 
@@ -595,11 +605,8 @@ _TRANSLATORS: dict[str, Callable[[_Writer, Component], None]] = {
     "MsidStatePower": _state_power,
     "AcisDpaStatePower": _electronics,
     "Mask": _mask,
-    "Pitch": _channel("pitch", levels=False),
-    "Roll": _channel("roll", levels=False),
-    "Eclipse": _channel("eclipse", levels=True),
-    "SimZ": _channel("sim_z", levels=True),
-    "DetectorHousingHeater": _channel("dh_heater", levels=True),
-    "CmdStatesData": _channel(None, levels=True),
+    **dict.fromkeys(
+        ("Pitch", "Roll", "Eclipse", "SimZ", "DetectorHousingHeater", "CmdStatesData", "TelemData"), _input
+    ),
 }
 """How each class is written; what is not here is refused by its name."""

@@ -453,7 +453,9 @@ class TwinSpec(Strict):
                 yield f"conductors[{i}].between: joins two boundaries; one end must be a node"
             if conductor.into in self.boundaries:
                 yield f"conductors[{i}].into: '{conductor.into}' is a boundary, which nothing heats; name the node"
-            if (ends, conductor.into) in pairs or (((ends, None) in pairs or conductor.into is None) and ends in joined):
+            if (ends, conductor.into) in pairs or (
+                ((ends, None) in pairs or conductor.into is None) and ends in joined
+            ):
                 yield f"conductors[{i}].between: {' and '.join(conductor.between)} are joined twice; add the conductances"
             pairs.add((ends, conductor.into))
             joined.add(ends)
