@@ -63,7 +63,15 @@ async def _running(
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
     housekeeping = Housekeeping(database)
-    schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
+    schedule = Schedule(
+        database,
+        service.registry,
+        runner,
+        settings.calibrate_every_s,
+        settings.anomaly_patience_s,
+        settings.refutation_rate,
+        live_state.evidence,
+    )
     try:
         yield service
     finally:

@@ -6,16 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin_core.anomaly.sufficiency import (
-    CUT,
-    LARGEST,
-    LEAVING,
-    TOLERANCE,
-    adjusted,
-    discoveries,
-    follow_evidence,
-    sizes,
-)
+from twin_core.anomaly import adjusted, discoveries
+from twin_core.anomaly.sufficiency import CUT, LARGEST, LEAVING, TOLERANCE, follow_evidence, sizes
 
 N_STEPS = 12
 SPREAD = {
@@ -114,7 +106,7 @@ def test_the_adjuster_integrates_to_one() -> None:
     far, _ = quad(lambda u: 1.0 / u**2, 50.0, np.inf)  # A(M) / M there, but for 1e-20
     assert near + far == pytest.approx(1.0, abs=1e-9)
     assert np.all(np.diff([adjusted(u) for u in np.linspace(0.0, 30.0, 400)]) > 0.0)
-    assert adjusted(-3.0) == 0.5 and adjusted(1e4) == np.inf
+    assert adjusted(-3.0) == 0.5 and np.isfinite(adjusted(1e4))
 
 
 def test_discoveries_are_the_largest_set_whose_least_member_pays_for_it() -> None:

@@ -19,17 +19,14 @@ L. Wasserman, A. Ramdas, S. Balakrishnan, Universal inference, PNAS 117 (2020) 1
 I. Waudby-Smith, A. Ramdas, Estimating means of bounded random variables by betting, J. R. Stat. Soc. B 86 (2024) 1,
 arXiv 2010.09686. M. Larsson, A. Ramdas, J. Ruf, The numeraire e-variable and reverse information projection, arXiv 2402.18810.
 M. Herbster, M. K. Warmuth, Tracking the best expert, Machine Learning 32 (1998) 151.
-Y. Tavyrikov, J. J. Goeman, R. de Heide, Carefree multiple testing with e-processes, arXiv 2501.19360.
-R. Wang, A. Ramdas, False discovery rate control with e-values, J. R. Stat. Soc. B 84 (2022) 822.
 """
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
 
-from twin_core._typing import BoolArray, FloatArray, Json
+from twin_core._typing import FloatArray, Json
 
 CUT = 3.0
 """Normalised innovations are cut here: the test is of means, and one broken reading must not decide it."""
@@ -129,32 +126,3 @@ def _wealth(
                 mean[s] += (psi - mean[s]) / MEMORY
             out[t, s] = log[s]
     return out
-
-
-def adjusted(log_most: float) -> float:
-    """Return an e-value from the greatest value that an e-process has ever had, given as its natural logarithm.
-
-    A maximum is no e-value. A(M) = (M - 1 - log M) / log² M is one, since its integral over M⁻² from 1 is one, and it gives
-    away less than any power of M (arXiv 2501.19360; G. Shafer, A. Shen, N. Vereshchagin, V. Vovk, Statist. Sci. 26 (2011)
-    84).
-    """
-    log_most = max(log_most, 0.0)
-    if log_most < 1e-4:
-        return 0.5 + log_most / 6.0  # the series about M = 1
-    if log_most > 700.0:
-        return math.inf
-    return (math.expm1(log_most) - log_most) / log_most**2
-
-
-def discoveries(e_values: Sequence[float], rate: float) -> BoolArray:
-    """Return which hypotheses fall at a false discovery rate, (n,): Benjamini and Hochberg's rule for e-values.
-
-    Whatever the dependence, at most ``rate`` of those named are true nulls, in expectation: the k largest fall where the
-    k-th is at least n / (k rate), for the largest such k. Adjusted maxima may be looked at again and again.
-    """
-    values = np.asarray(e_values, dtype=np.float64)
-    order = np.argsort(-values, kind="stable")
-    passes = np.flatnonzero(values[order] * (np.arange(values.size) + 1) * rate >= values.size)
-    fallen = np.zeros(values.size, dtype=np.bool_)
-    fallen[order[: passes[-1] + 1 if passes.size else 0]] = True
-    return fallen
