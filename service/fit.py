@@ -1,6 +1,6 @@
 """Whether a model that was made elsewhere fits a twin: its filter reads the archive by name, in the declared units."""
 
-from service.problems import BadField
+from service.errors import BadField
 from service.registry import Entry
 from twin_core.network.spec import Node, TwinSpec
 

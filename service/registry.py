@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.problems import BadField, Problem
+from service.errors import BadField, short
+from service.store.errors import Missing
 from service.store.twins import Twin
 from twin_core.network.plausible import plausible_range
 from twin_core.network.spec import TwinSpec
@@ -91,11 +92,11 @@ class Registry:
         self._entries.pop(name, None)
 
     def get(self, name: str) -> Entry:
-        """Return one twin; Problem 404 if there is none of that name."""
+        """Return one twin; Missing if there is none of that name."""
         try:
             return self._entries[name]
         except KeyError:
-            raise Problem(404, f"no twin '{name}' is registered") from None
+            raise Missing(f"no twin '{short(name)}' is registered") from None
 
     def __iter__(self) -> Iterator[Entry]:
         """Iterate over the twins."""

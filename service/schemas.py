@@ -59,6 +59,7 @@ class TwinInfo(_Answer):
 class Assimilation(_Answer):
     """How far the active model has followed the archive: ``done`` of ``of`` samples, the rest in the background.
 
+    ``since`` is where the part of the archive begins that is followed, null: all of it (``TWIN_ASSIMILATE_SAMPLES``);
     ``state_time`` is the instant of the present state, ``behind_s`` by how many seconds of telemetry that lies before the
     last sample.
     """
@@ -67,6 +68,7 @@ class Assimilation(_Answer):
     of: int
     state_time: Instant | None
     behind_s: float
+    since: Instant | None = None
 
 
 class ChannelState(_Answer):
@@ -188,20 +190,28 @@ class Archive(_Answer):
     downsampled: bool
 
 
-class CalibrationRequest(_Request):
-    """What a calibration uses: the whole archive unless a part is named."""
+class _Selecting(_Request):
+    """Which part of the archive a job looks at: the newest ``samples`` of start <= time < stop.
 
-    method: str = "second-order"
+    With ``thin`` it looks at as many samples evenly over that time instead, of which inputs that hold have their mean.
+    """
+
     start: Time | None = None
     stop: Time | None = None
+    samples: Annotated[int, Field(ge=20)] | None = Field(default=None, description="absent: as TWIN_JOB_VALUES says")
+    thin: bool = False
+
+
+class CalibrationRequest(_Selecting):
+    """What a calibration uses."""
+
+    method: str = "second-order"
     activate: bool | None = Field(default=None, description="true: always, false: never, absent: if it is the better")
 
 
-class DiagnosisRequest(_Request):
+class DiagnosisRequest(_Selecting):
     """What a diagnosis uses and how much of it is held back for the score."""
 
-    start: Time | None = None
-    stop: Time | None = None
     holdout: Share = 0.3
     burn_in_s: Positive | None = None
     false_alarm_rate: Annotated[float, BeforeValidator(_finite), Field(gt=0, lt=0.5)] = 0.01

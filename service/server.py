@@ -11,7 +11,7 @@ from collections.abc import Callable
 import uvicorn
 
 from service.app import create_app
-from service.patience import patient
+from service.http.protocol import patient
 from service.settings import Settings, unknown_variables
 from service.store.database import Database
 from service.workbench import MakeWorkbench

@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.access import Role, is_loopback, parse_keys
+from service.http.auth import Role, is_loopback, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
@@ -36,7 +36,16 @@ class Settings(BaseSettings):
     )
     job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
+    job_values: int = Field(
+        250_000,
+        ge=1000,
+        description="Most values, samples times channels, that a job takes unless its request says more.",
+    )
+    job_memory_mib: int = Field(2048, ge=256, description="A job that needs more memory is ended and marked failed.")
     assimilate: bool = Field(True, description="Whether new samples update the state of the active model.")
+    assimilate_samples: int = Field(
+        200_000, ge=1000, description="A model that becomes active follows at most so many samples of the past."
+    )
     calibrate_every_s: float | None = Field(None, gt=0, description="Recalibrate on this schedule; unset: on request.")
     anomaly_patience_s: float = Field(3600.0, ge=0, description="Recalibrate if an anomaly lasts so long; 0: never.")
     false_alarm_rate: float = Field(

@@ -37,7 +37,7 @@ class Following:
         self._engine, self._thresholds = engine, thresholds
 
     async def filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
-        """Filter a block from a position; TwinError or Problem if it cannot be done."""
+        """Filter a block from a position; TwinError or Refusal if it cannot be done."""
         clean, seen = await self._readings(fresh, before)
         telemetry, held = stretch(self._twin, clean, active.epoch_us, before)
         state = None if before is None else before.state
@@ -46,6 +46,17 @@ class Following:
     async def memory_s(self, active: Active, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model where some telemetry begins."""
         return await self._engine.memory_s(active.document, telemetry)
+
+    async def opened(self, fresh: Samples) -> Samples:
+        """Return samples of which the first has the inputs that hold there, whenever they came."""
+        inputs = [row for row, name in enumerate(self._twin.channels) if name not in self._twin.sensors]
+        missing = [row for row in inputs if np.isnan(fresh.values[row, 0])]
+        if missing:
+            n, first_us = len(self._twin.channels), int(fresh.time_us[0])
+            held = await self._database.read(samples.last_values, self._twin.key, n, missing, first_us)
+            for row, value in held.items():
+                fresh.values[row, 0] = value
+        return fresh
 
     async def _readings(self, fresh: Samples, before: Position | None) -> tuple[Samples, Samples]:
         """Return a block without what the samples before it show to be no readings, and without missing ones alone."""

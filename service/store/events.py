@@ -1,13 +1,13 @@
 """Events of a twin's stream that are not samples: jobs, models, anomalies, each with its number."""
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import orjson
 
-from service.store.gone import TwinGone
+from service.store.connection import Connection
+from service.store.errors import TwinGone
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Event:
     body: dict[str, Any]
 
 
-def claim(connection: sqlite3.Connection, twin: int, count: int) -> int:
+def claim(connection: Connection, twin: int, count: int) -> int:
     """Reserve ``count`` consecutive numbers of a twin's stream; return the first."""
     row = connection.execute("UPDATE head SET seq = seq + ? WHERE twin = ? RETURNING seq", (count, twin)).fetchone()
     if row is None:
@@ -29,7 +29,7 @@ def claim(connection: sqlite3.Connection, twin: int, count: int) -> int:
 
 
 def append(
-    connection: sqlite3.Connection, twin: int, time_us: int, messages: Sequence[tuple[str, dict[str, Any]]]
+    connection: Connection, twin: int, time_us: int, messages: Sequence[tuple[str, dict[str, Any]]]
 ) -> list[Event]:
     """Store messages given as (type, body) and return them with their numbers."""
     first = claim(connection, twin, len(messages))
@@ -39,7 +39,7 @@ def append(
     return events
 
 
-def since_seq(connection: sqlite3.Connection, twin: int, after_seq: int) -> list[Event]:
+def since_seq(connection: Connection, twin: int, after_seq: int) -> list[Event]:
     """Return the events after one number, in order."""
     query = "SELECT seq, time_us, type, body FROM event WHERE twin = ? AND seq > ? ORDER BY seq"
     return [

@@ -1,6 +1,5 @@
 """Twins: what was registered, and how far their archive reaches."""
 
-import sqlite3
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,7 +7,8 @@ from typing import Any
 import orjson
 
 from service.instants import now_us
-from service.problems import Problem
+from service.store.connection import Connection
+from service.store.errors import Conflicting, Missing
 
 
 @dataclass(frozen=True)
@@ -50,36 +50,40 @@ def canonical(specification: dict[str, Any]) -> bytes:
     return orjson.dumps(specification, option=orjson.OPT_SORT_KEYS)
 
 
-def register(connection: sqlite3.Connection, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
-    """Return the twin, and whether it is new; Problem 409 if the id means another specification already."""
+def register(connection: Connection, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
+    """Return the twin, and whether it is new; Conflicting if the id means another specification already."""
     try:
         known = get(connection, name)
-    except Problem:
+    except Missing:
         text = orjson.dumps(specification).decode()
         values = (name, text, now_us())
         row = connection.execute("INSERT INTO twin (name, specification, created_us) VALUES (?, ?, ?)", values)
         connection.execute("INSERT INTO head (twin) VALUES (?)", (row.lastrowid,))
         return get(connection, name), True
     if canonical(known.specification) != canonical(specification):
-        raise Problem(409, f"twin: '{name}' is registered with another specification; delete it or choose another id")
+        raise Conflicting(f"twin: '{name}' is registered with another specification; delete it or choose another id")
     return known, False
 
 
-def get(connection: sqlite3.Connection, name: str) -> Twin:
-    """Return one twin; Problem 404 if there is none of that name."""
+def get(connection: Connection, name: str) -> Twin:
+    """Return one twin; Missing if there is none of that name."""
     row = connection.execute(_SELECT + "WHERE twin.name = ?", (name,)).fetchone()
     if row is None:
-        raise Problem(404, f"no twin '{name}' is registered")
+        raise Missing(f"no twin '{name}' is registered")
     return Twin(*row)
 
 
-def select(connection: sqlite3.Connection) -> list[Twin]:
+def select(connection: Connection) -> list[Twin]:
     """Return every twin, by name."""
     return [Twin(*row) for row in connection.execute(_SELECT + "ORDER BY twin.name")]
 
 
-def delete(connection: sqlite3.Connection, name: str) -> Twin:
-    """Delete a twin with everything that belongs to it; Problem 404 if there is none."""
+def delete(connection: Connection, name: str) -> Twin:
+    """Delete a twin with everything that belongs to it; Missing if there is none.
+
+    Nobody finds it any more, and its name is free; its rows are removed bit by bit (``retention.sweep_gone``).
+    """
     twin = get(connection, name)
-    connection.execute("DELETE FROM twin WHERE id = ?", (twin.key,))
+    connection.execute("DELETE FROM head WHERE twin = ?", (twin.key,))
+    connection.execute("UPDATE twin SET name = '~' || id, gone_us = ? WHERE id = ?", (now_us(), twin.key))
     return twin

@@ -3,7 +3,7 @@
 import httpx
 import pytest
 
-from service.access import Role, parse_keys
+from service.http.auth import Role, parse_keys
 from service.settings import SettingsError, read_settings
 from tests.service.harness import AppClient
 

@@ -12,17 +12,19 @@ from fastapi import Depends, Path
 from fastapi.dependencies.models import Dependant
 from starlette.requests import HTTPConnection
 
-from service.access import Role
+from service.errors import short
+from service.housekeeping import Housekeeping
+from service.http.auth import Role
+from service.http.problems import Problem
 from service.intake import Intake
 from service.jobs.runner import Jobs
 from service.live.live import Live
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry, Registry
 from service.settings import Settings
 from service.store import twins
 from service.store.database import Database
-from service.store.gone import TwinGone
+from service.store.errors import TwinGone
 from service.store.twins import Twin
 from service.streams import Hub
 
@@ -39,6 +41,7 @@ class Service:
     live: Live
     intake: Intake
     jobs: Jobs
+    housekeeping: Housekeeping
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def add_twin(self, twin: Twin) -> Entry:
@@ -67,6 +70,7 @@ class Service:
             await self.live.remove(twin)
             await self.database.write(twins.delete, twin.name)
             self.hub.close(twin.key)
+            self.housekeeping.wake()
 
 
 async def running_service(connection: HTTPConnection) -> Service:
@@ -106,7 +110,7 @@ def refuse_unknown(connection: HTTPConnection, known: Collection[str] = ()) -> N
         errors = [(name, "unknown parameter") for name in connection.query_params if name not in known]
         if errors:
             expected = f"known: {', '.join(known)}" if known else "there are none"
-            raise Problem(422, f"{errors[0][0]}: unknown parameter ({expected})", errors)
+            raise Problem(422, f"{short(errors[0][0])}: unknown parameter ({expected})", errors)
 
 
 async def known_parameters(connection: HTTPConnection) -> None:

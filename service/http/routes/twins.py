@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Response
 
-from service.deps import NamedTwin, Running, Service, operates, reads
+from service.http.deps import NamedTwin, Running, Service, operates, reads
 from service.instants import format_instant, now_us
 from service.live import forecasts
 from service.registry import Entry
@@ -44,7 +44,8 @@ async def _detail(service: Service, twin: Twin) -> TwinDetail:
     if tracker is not None and tracker.active is not None:
         lag = await forecasts.behind(tracker, service.database)
         state_us = None if tracker.position is None else tracker.position.time_us
-        progress = Assimilation(done=lag.done, of=lag.of, state_time=_when(state_us), behind_s=lag.seconds)
+        since = _when(tracker.floor_us)
+        progress = Assimilation(done=lag.done, of=lag.of, state_time=_when(state_us), behind_s=lag.seconds, since=since)
     entry = service.registry.get(twin.name)
     return TwinDetail(
         **_info(twin),

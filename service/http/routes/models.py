@@ -4,8 +4,8 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Path
 
-from service.deps import NamedTwin, Running, operates, reads
 from service.fit import refuse_foreign
+from service.http.deps import NamedTwin, Running, operates, reads
 from service.jobs import outcome
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
 from service.store import models
