@@ -163,6 +163,28 @@ class Quarantine(_Answer):
     values: dict[str, list[float | None]]
 
 
+class RetentionRequest(_Request):
+    """How long what belongs to a twin is kept; null: for ever.
+
+    Days count back from the twin's newest sample; ``models`` and ``jobs`` are numbers of the newest ones that stay, beside the
+    active model and its parent, and of jobs of each kind.
+    """
+
+    samples_days: Positive | None = None
+    residuals_days: Positive | None = None
+    models: Annotated[int, Field(ge=0)] | None = None
+    jobs: Annotated[int, Field(ge=0)] | None = None
+
+
+class Retention(_Answer):
+    """How long what belongs to a twin is kept."""
+
+    samples_days: float | None
+    residuals_days: float | None
+    models: int | None
+    jobs: int | None
+
+
 class Columns(BaseModel):
     """Samples as columns: one value or null per time and channel, in the channel's own unit."""
 

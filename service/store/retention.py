@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 import orjson
 
 from service.store.connection import Connection
+from service.store.errors import Conflicting, Missing
 
 ROWS = 8
 """So many chunks, of up to some megabytes each, are removed in one write."""
@@ -161,6 +162,15 @@ def remove_model(connection: Connection, twin: int, version: int) -> None:
     for table in ("checkpoint", "anomaly", "floor"):
         connection.execute(f"DELETE FROM {table} WHERE twin = ? AND version = ?", (twin, version))
     connection.execute("DELETE FROM model WHERE twin = ? AND version = ?", (twin, version))
+
+
+def delete_model(connection: Connection, twin: int, version: int) -> None:
+    """Remove a version; Missing if there is none, Conflicting if it is active."""
+    if connection.execute("SELECT 1 FROM model WHERE twin = ? AND version = ?", (twin, version)).fetchone() is None:
+        raise Missing(f"version: there is no model version {version}")
+    if version == _active(connection, twin):
+        raise Conflicting(f"version {version} is active; activate another one first")
+    remove_model(connection, twin, version)
 
 
 def _dear_residuals(connection: Connection, twin: int) -> int:

@@ -214,3 +214,29 @@ def test_residuals_take_less_room_than_the_archive_and_go_with_their_model(make_
         assert reader.execute(size.format("residual")).fetchone()[0] <= archive
     reader.close()
     assert client.get(f"{TWIN}/residuals").json()["samples"] == 9000
+
+
+def test_retention_keeps_what_it_says(make_client: Any) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, 9000, 1000):
+        ingest(client, first, 1000)
+    for _ in range(4):
+        calibrate(client, {"activate": True})
+    assert client.delete(f"{TWIN}/models/4").status_code == 409
+    assert client.delete(f"{TWIN}/models/1").status_code == 204
+    assert client.delete(f"{TWIN}/models/1").status_code == 404
+    kept = {"samples_days": 3000 / 86_400, "residuals_days": None, "models": 0, "jobs": 1}
+    assert client.request("PUT", f"{TWIN}/retention", json=kept).json() == kept
+    assert client.get(f"{TWIN}/retention").json() == kept
+    for _ in range(200):
+        versions = [model["version"] for model in client.get(f"{TWIN}/models").json()["models"]]
+        if versions == [3, 4] and client.get(TWIN).json()["samples"] <= 4000:  # the active one and its parent
+            break
+        time.sleep(0.05)
+    archive = client.get(f"{TWIN}/telemetry").json()
+    assert versions == [3, 4] and 3000 <= archive["samples"] <= 4000
+    assert archive["time"][0] == client.get(TWIN).json()["first_time"]
+    assert len(client.get(f"{TWIN}/calibrations").json()["jobs"]) == 1
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()["behind_s"] == 0.0
+    assert client.request("PUT", f"{TWIN}/retention", json={"samples_days": -1}).status_code == 422

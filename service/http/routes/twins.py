@@ -1,5 +1,6 @@
 """Twins: register, list, inspect, delete."""
 
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Response
@@ -8,8 +9,8 @@ from service.http.deps import NamedTwin, Running, Service, operates, reads
 from service.instants import format_instant, now_us
 from service.live import forecasts
 from service.registry import Entry
-from service.schemas import Assimilation, ChannelState, TwinDetail, TwinInfo, TwinList
-from service.store import anomalies, twins
+from service.schemas import Assimilation, ChannelState, Retention, RetentionRequest, TwinDetail, TwinInfo, TwinList
+from service.store import anomalies, retention, twins
 from service.store.twins import Twin
 from twin_core.network.spec_io import dump_spec, load_spec
 
@@ -94,6 +95,21 @@ async def list_twins(service: Running) -> TwinList:
 async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
     """Return one twin with its specification."""
     return await _detail(service, await service.database.read(twins.get, twin.name))
+
+
+@router.get("/{twin}/retention", dependencies=[reads])
+async def keeps(service: Running, twin: NamedTwin) -> Retention:
+    """Return how long what belongs to the twin is kept."""
+    return Retention(**asdict(await service.database.read(retention.get, twin.key)))
+
+
+@router.put("/{twin}/retention", dependencies=[operates])
+async def keep(service: Running, twin: NamedTwin, request: RetentionRequest) -> Retention:
+    """Settle how long what belongs to the twin is kept; what is older goes for ever, within minutes."""
+    wanted = retention.Retention(**request.model_dump())
+    await service.database.write(retention.put, twin.key, wanted)
+    service.housekeeping.wake()
+    return Retention(**asdict(wanted))
 
 
 @router.delete("/{twin}", status_code=204, dependencies=[operates])
