@@ -9,19 +9,22 @@ from typing import Any
 from fastapi import Depends, FastAPI
 
 from service.core_workbench import CoreWorkbench
+from service.dispatch import Dispatch
 from service.housekeeping import Housekeeping
 from service.http import problems
+from service.http.audit import Audit
 from service.http.auth import Gate
 from service.http.body_limit import Bodies
 from service.http.deps import Service, known_parameters
 from service.http.head import Heads
-from service.http.routes import alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
+from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.http.shortcut import Shortcut
 from service.intake import Intake
 from service.jobs.executor import ProcessPerTask
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
+from service.live.silence import Silence
 from service.metrics import Metrics, Observe
 from service.registry import Registry
 from service.settings import Settings, read_settings
@@ -43,6 +46,8 @@ ROUTERS = (
     live.router,
     alarms.router,
     streams.router,
+    admin.audit,
+    admin.webhooks,
 )
 
 
@@ -72,12 +77,16 @@ async def _running(
     service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner, housekeeping)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
+    dispatch = Dispatch(database)
+    silence = Silence(service.registry, live_state, hub)
     schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
     try:
         yield service
     finally:
         hub.close()
+        await silence.close()
         await schedule.close()
+        await dispatch.close()
         await housekeeping.close()
         await runner.close()
         await live_state.close()
@@ -111,6 +120,7 @@ def create_app(
     settings = settings or read_settings()
     make_workbench = workbench or partial(CoreWorkbench, settings.effect_files)
     metrics = Metrics()
+    keys = settings.keys
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -141,7 +151,9 @@ def create_app(
         app.mount(path, files, name=path)
     app.add_middleware(Shortcut, route=telemetry.ingesting)
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-    app.add_middleware(Gate, keys=settings.roles)
+    app.state.keys = keys
+    app.add_middleware(Gate, keys=keys)
+    app.add_middleware(Audit)
     app.add_middleware(Observe, metrics=metrics)
     app.add_middleware(Heads)
     return app

@@ -103,7 +103,7 @@ def _joined(batches: list[Batch]) -> Batch:
     """Return batches as one, in their order."""
     if len(batches) == 1:
         return batches[0]
-    return samples.joined(batches, batches[0].values.shape[0])
+    return samples.joined(batches, max(batch.values.shape[0] for batch in batches))
 
 
 def take_in(

@@ -52,6 +52,7 @@ class TwinInfo(_Answer):
     last_time: Instant | None
     active_model: int | None
     quarantined: int = 0
+    revision: int = 1
     seq: int
     channels: list[str]
 
@@ -99,6 +100,36 @@ class TwinDetail(TwinInfo):
     assimilation: Assimilation | None = None
     telemetry: dict[str, ChannelState] = {}
     specification: dict[str, Any]
+
+
+class Standing(_Answer):
+    """Whether a model version still holds: ``lacks`` says what its specification and the twin's do not have in common."""
+
+    version: int
+    active: bool
+    holds: bool
+    lacks: list[str]
+
+
+class RevisedTwin(TwinDetail):
+    """A twin after its specification was changed."""
+
+    models: list[Standing]
+
+
+class Revision(_Answer):
+    """A former specification, and until when it held."""
+
+    number: int
+    until: Instant
+    specification: dict[str, Any]
+
+
+class RevisionList(_Answer):
+    """The former specifications of a twin, the newest first; ``current`` is the number of the present one."""
+
+    current: int
+    revisions: list[Revision]
 
 
 class TwinList(_Answer):
@@ -161,6 +192,80 @@ class Quarantine(_Answer):
     time: list[Instant]
     received: list[Instant]
     values: dict[str, list[float | None]]
+
+
+class AuditLine(_Answer):
+    """One change or refusal: ``who`` is the name of a key, ``client`` an address."""
+
+    id: int
+    time: Instant
+    who: str
+    method: str
+    path: str
+    status: int
+    client: str
+    detail: str
+
+
+class AuditList(_Answer):
+    """Lines of the audit log, the newest first."""
+
+    audit: list[AuditLine]
+
+
+WebhookEvent = Literal["anomaly", "limit", "stale", "model", "job_failed"]
+DeliveryState = Literal["waiting", "delivered", "dead"]
+
+
+class WebhookRequest(_Request):
+    """Where to send which events of which twins; null: all. Without a secret one is made."""
+
+    url: Annotated[str, Field(max_length=2000)]
+    twins: list[str] | None = None
+    types: list[WebhookEvent] | None = None
+    secret: Annotated[str, Field(min_length=16, max_length=200)] | None = None
+
+
+class Webhook(_Answer):
+    """A webhook without its secret."""
+
+    id: int
+    url: str
+    twins: list[str] | None
+    types: list[WebhookEvent] | None
+    created: Instant
+
+
+class WebhookMade(Webhook):
+    """A webhook with the secret that signs what it is sent."""
+
+    secret: str
+
+
+class WebhookList(_Answer):
+    """Every webhook."""
+
+    webhooks: list[Webhook]
+
+
+class WebhookDelivery(_Answer):
+    """One message to a webhook; ``reason`` says what went wrong last, ``next`` when it is tried again."""
+
+    id: int
+    webhook: int
+    created: Instant
+    event: WebhookEvent
+    state: DeliveryState
+    attempts: int
+    next: Instant | None
+    reason: str
+    body: dict[str, Any]
+
+
+class DeliveryList(_Answer):
+    """Deliveries, the newest first."""
+
+    deliveries: list[WebhookDelivery]
 
 
 class RetentionRequest(_Request):
@@ -461,6 +566,6 @@ class ShelveRequest(_Request):
 class Message(_Answer):
     """One message of a stream."""
 
-    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "alarm", "dropped"]
+    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "alarm", "twin", "stale", "dropped"]
     seq: int
     time: Instant

@@ -6,7 +6,7 @@ All of them are coroutines, although none waits: a plain function would be run i
 import asyncio
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Path
 from fastapi.dependencies.models import Dependant
@@ -14,19 +14,22 @@ from starlette.requests import HTTPConnection
 
 from service.errors import short
 from service.housekeeping import Housekeeping
-from service.http.auth import Role
+from service.http.keys import Role
 from service.http.problems import Problem
+from service.http.specification_body import Specified
 from service.intake import Intake
+from service.jobs import outcome
 from service.jobs.runner import Jobs
 from service.live.live import Live
 from service.metrics import Metrics
 from service.registry import Entry, Registry
 from service.settings import Settings
-from service.store import twins
+from service.store import retention, twins
 from service.store.database import Database
 from service.store.errors import TwinGone
 from service.store.twins import Twin
 from service.streams import Hub
+from twin_core.network.spec import TwinSpec
 
 
 @dataclass
@@ -44,21 +47,42 @@ class Service:
     housekeeping: Housekeeping
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    def add_twin(self, twin: Twin) -> Entry:
-        """Let a stored twin take part in everything."""
+    def add_twin(self, twin: Twin, spec: TwinSpec | None = None) -> Entry:
+        """Let a stored twin take part in everything; its specification need not be checked again where it just was."""
         entry = self.registry.add(twin)
+        if spec is not None:
+            entry.know(spec)
         self.hub.open(entry.key, twin.seq)
         if self.settings.assimilate:
             self.live.add(entry)
         self.live.arrived(entry)  # what the archive holds and nobody has looked at
         return entry
 
-    async def register(self, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
+    async def register(self, given: Specified) -> tuple[Twin, bool]:
         """Return the twin, and whether it is new; never between the steps of a deletion."""
         async with self._coming_and_going:
-            twin, is_new = await self.database.write(twins.register, name, specification)
-            self.add_twin(twin)
+            twin, is_new = await self.database.write(twins.register, given.spec.twin, given.data)
+            self.add_twin(twin, given.spec if is_new else None)
             return twin, is_new
+
+    async def revise(self, twin: Entry, given: Specified) -> tuple[Twin, bool]:
+        """Give a twin another specification; return it, and whether anything changed. Streams end and resume."""
+        async with self._coming_and_going:
+            if self.registry.get(twin.name) is not twin:
+                raise TwinGone(f"twin {twin.key} is gone")
+            made, is_new = await self.database.write(twins.revise, twin.name, given.data)
+            if is_new:
+                await self.live.remove(twin)
+                self.hub.close(twin.key)
+                entry = self.registry.replace(made)
+                entry.know(given.spec)
+                left = int(entry.sensors != twin.sensors)
+                while left:
+                    left = await self.database.write(retention.forget_derived, twin.key)
+                self.add_twin(made)
+                news = [("twin", {"revision": made.revision})]
+                await self.hub.write(twin.key, outcome.tell, twin.key, news)
+            return made, is_new
 
     async def remove_twin(self, twin: Entry) -> None:
         """Stop whatever concerns a twin, then delete it; Problem 404 if somebody else just did."""

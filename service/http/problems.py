@@ -91,10 +91,14 @@ def answer(error: Exception) -> Response:
         return problem(status_of(error), error.detail, error.errors)
     if isinstance(error, TwinGone):
         return problem(404, "the twin was deleted meanwhile")
+    assert isinstance(error, TwinError)
+    return problem(422, str(error), fields_of(error))
+
+
+def fields_of(error: TwinError) -> FieldErrors:
+    """Return the fields that an error of the core names."""
     told = [line.partition(": ") for line in getattr(error, "problems", (str(error),))]
-    return problem(
-        422, str(error), [(field, reason) for field, separator, reason in told if separator and " " not in field]
-    )
+    return [(field, reason) for field, separator, reason in told if separator and " " not in field]
 
 
 async def _nothing_there(scope: Scope, receive: Receive, send: Send) -> None:

@@ -162,6 +162,7 @@ def _end(process: Any) -> None:
 def prepare_worker() -> None:
     """Make a worker process live exactly as long as the service wants it to."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the parent decides
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as does the parent
     Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -157,6 +157,11 @@ def _brief(connection: Connection, twin: int, kind: str, job: str) -> Json:
     return wire
 
 
+def tell(connection: Connection, twin: int, messages: list[tuple[str, Json]]) -> tuple[None, Sequence[Stretch]]:
+    """Tell the stream something."""
+    return None, [EventStretch(tuple(events.append(connection, twin, now_us(), messages)))]
+
+
 def announce(
     connection: Connection, twin: int, kind: str, job: str, change: Any, *args: Any
 ) -> tuple[Json, Sequence[Stretch]]:

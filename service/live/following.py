@@ -68,6 +68,19 @@ class Following:
             context = await self._database.read(samples.select, self._twin.key, n, range(n), *span_us)
         return await screening.readings(self._twin, self._engine, context, fresh)
 
+    def _in_order(
+        self, sensors: tuple[str, ...], *matrices: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (n_times, n_sensors) matrices with a column per sensor of the twin, NaN where the model knows it not."""
+        if sensors == self._twin.sensors:
+            return matrices[0], matrices[1]
+        ordered = [np.full((m.shape[0], len(self._twin.sensors)), np.nan) for m in matrices]
+        for column, name in enumerate(self._twin.sensors):
+            if name in sensors:
+                for made, matrix in zip(ordered, matrices, strict=True):
+                    made[:, column] = matrix[:, sensors.index(name)]
+        return ordered[0], ordered[1]
+
     def step(
         self,
         active: Active,
@@ -113,6 +126,6 @@ class Following:
         recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
         after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, detector, recent_us)
         checkpoint = None if is_provisional else after.checkpoint()
-        found = (time_us, innovation, std, nis, told, changes)
+        found = (time_us, *self._in_order(filtered.sensors, innovation, std), nis, told, changes)
         step = Step(active.version, revision, after_us, after_gap, *found, checkpoint)
         return after, step

@@ -6,6 +6,7 @@ from typing import Any
 
 import orjson
 
+from service.store import webhooks
 from service.store.connection import Connection
 from service.store.errors import TwinGone
 
@@ -36,6 +37,8 @@ def append(
     events = [Event(first + i, time_us, kind, body) for i, (kind, body) in enumerate(messages)]
     rows = [(twin, event.seq, time_us, event.type, orjson.dumps(event.body).decode()) for event in events]
     connection.executemany("INSERT INTO event (twin, seq, time_us, type, body) VALUES (?, ?, ?, ?, ?)", rows)
+    for event in events:
+        webhooks.enqueue(connection, twin, event.seq, time_us, event.type, event.body)
     return events
 
 

@@ -57,6 +57,11 @@ class Active:
         """Longest time step of its rollouts."""
         return float(self.parsed()["max_step_s"])
 
+    @cached_property
+    def specification(self) -> dict[str, Any]:
+        """The specification that it was made from."""
+        return dict(self.parsed()["spec"])
+
     @property
     def longest_gap_us(self) -> float:
         """Beyond a longer interval the assimilation starts anew."""

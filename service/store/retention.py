@@ -121,6 +121,14 @@ def _old_residuals(connection: Connection, twin: int, kept: Retention, last_us: 
     return removed
 
 
+def forget_derived(connection: Connection, twin: int) -> int:
+    """Remove a part of what models derived from the archive of a twin, so that it is assimilated anew."""
+    for table in ("checkpoint", "floor"):
+        connection.execute(f"DELETE FROM {table} WHERE twin = ?", (twin,))
+    query = "DELETE FROM residual WHERE id IN (SELECT id FROM residual WHERE twin = ? LIMIT ?)"
+    return connection.execute(query, (twin, ROWS)).rowcount
+
+
 def _old_jobs(connection: Connection, twin: int, kept: Retention) -> int:
     if kept.jobs is None:
         return 0

@@ -160,10 +160,16 @@ def unpack(n_rows: int, time: bytes, value: bytes, received: bytes | None) -> Ba
     return Batch(time_us, matrix(value, n_rows, time_us.size), arrived_us)
 
 
+def _widened(values: NDArray[np.float64], n_rows: int) -> NDArray[np.float64]:
+    """Return values with rows of missing ones for channels that the twin has got since."""
+    missing = n_rows - values.shape[0]
+    return np.vstack([values, np.full((missing, values.shape[1]), np.nan)]) if missing else values
+
+
 def joined(batches: Sequence[Batch], n_rows: int) -> Batch:
     """Return batches as one, in their order."""
     times = [np.empty(0, dtype=np.int64), *(batch.time_us for batch in batches)]
-    values = [np.empty((n_rows, 0)), *(batch.values for batch in batches)]
+    values = [np.empty((n_rows, 0)), *(_widened(batch.values, n_rows) for batch in batches)]
     received = [np.empty(0, dtype=np.int64), *(batch.received for batch in batches)]
     return Batch(np.concatenate(times), np.concatenate(values, axis=1), np.concatenate(received))
 

@@ -25,10 +25,11 @@ class Twin:
     last_us: int | None
     active_version: int | None
     quarantined: int
+    revision: int = 1
 
     @cached_property
     def specification(self) -> dict[str, Any]:
-        """The specification as it was first registered."""
+        """The specification as it is now, with its channels in the order of the archive."""
         return dict(orjson.loads(self.text))
 
     @cached_property
@@ -40,7 +41,8 @@ class Twin:
 _SELECT = """
     SELECT twin.id, twin.name, twin.specification, twin.created_us, head.seq, head.samples, head.first_us, head.last_us,
            (SELECT version FROM activation WHERE activation.twin = twin.id ORDER BY id DESC LIMIT 1),
-           (SELECT coalesce(sum(n), 0) FROM aside WHERE aside.twin = twin.id AND deletion IS NULL)
+           (SELECT coalesce(sum(n), 0) FROM aside WHERE aside.twin = twin.id AND deletion IS NULL),
+           twin.revision
     FROM twin JOIN head ON head.twin = twin.id
 """
 
@@ -61,8 +63,46 @@ def register(connection: Connection, name: str, specification: dict[str, Any]) -
         connection.execute("INSERT INTO head (twin) VALUES (?)", (row.lastrowid,))
         return get(connection, name), True
     if canonical(known.specification) != canonical(specification):
-        raise Conflicting(f"twin: '{name}' is registered with another specification; delete it or choose another id")
+        raise Conflicting(
+            f"twin: '{name}' is registered with another specification; PUT changes it, or choose another id"
+        )
     return known, False
+
+
+def revise(connection: Connection, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
+    """Give a twin another specification; return it, and whether anything changed. The former one stays on record.
+
+    Raises
+    ------
+    Missing, Conflicting
+        If there is no such twin; if a channel is gone or has another kind or unit, since the archive goes on.
+    """
+    known = get(connection, name)
+    if canonical(known.specification) == canonical(specification):
+        return known, False
+    channels = specification["channels"]
+    for channel, declared in known.specification["channels"].items():
+        if channel not in channels:
+            raise Conflicting(
+                f"channels: '{channel}' is missing; its samples are in the archive: declare it, though nothing needs to use it",
+                [("channels", f"'{channel}' is missing")],
+            )
+        for field in ("kind", "unit", "levels"):
+            if channels[channel].get(field) != declared.get(field):
+                what = f"is {channels[channel].get(field)}, the archive's is {declared.get(field)}"
+                raise Conflicting(f"channels.{channel}.{field}: {what}", [(f"channels.{channel}.{field}", what)])
+    order = [*known.channels, *(c for c in channels if c not in known.channels)]
+    text = orjson.dumps({**specification, "channels": {c: channels[c] for c in order}}).decode()
+    values = (known.key, known.revision, now_us(), known.text)
+    connection.execute("INSERT INTO revision (twin, number, at_us, specification) VALUES (?, ?, ?, ?)", values)
+    connection.execute("UPDATE twin SET specification = ?, revision = revision + 1 WHERE id = ?", (text, known.key))
+    return get(connection, name), True
+
+
+def revisions(connection: Connection, twin: int) -> list[tuple[int, int, dict[str, Any]]]:
+    """Return the former specifications of a twin as (number, until when, specification), the newest first."""
+    query = "SELECT number, at_us, specification FROM revision WHERE twin = ? ORDER BY number DESC"
+    return [(number, at_us, orjson.loads(text)) for number, at_us, text in connection.execute(query, (twin,))]
 
 
 def get(connection: Connection, name: str) -> Twin:

@@ -8,6 +8,7 @@ import orjson
 from fastapi import APIRouter, Query, Response
 
 from service.downsample import extremes
+from service.fit import lacks
 from service.http.deps import NamedTwin, Running, Service, reads
 from service.http.routes.telemetry import Points, bounded, span
 from service.instants import format_instant, format_instants
@@ -50,6 +51,11 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     expected = list(limits.expected(twin, look.position.time_us, look.made))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    if missing := lacks(look.active.specification, twin.specification):
+        what = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        document["notices"].append(
+            f"model version {look.active.version} was made for another revision of the specification: {what}; recalibrate"
+        )
     return Response(orjson.dumps(document), media_type="application/json")
 
 

@@ -13,8 +13,8 @@ from starlette.routing import Route
 from service import archive_changes, export
 from service.downsample import extremes
 from service.errors import BadField, short
-from service.http.auth import Role
 from service.http.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
+from service.http.keys import Role
 from service.http.problems import Problem
 from service.http.telemetry_body import parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_instant, parse_parameter

@@ -1,18 +1,33 @@
 """Twins: register, list, inspect, delete."""
 
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Body, Response
+from fastapi import APIRouter, Request, Response
 
+from service.errors import BadField
+from service.fit import lacks
 from service.http.deps import NamedTwin, Running, Service, operates, reads
+from service.http.specification_body import BODY, read_specification
 from service.instants import format_instant, now_us
 from service.live import forecasts
 from service.registry import Entry
-from service.schemas import Assimilation, ChannelState, Retention, RetentionRequest, TwinDetail, TwinInfo, TwinList
-from service.store import anomalies, retention, twins
+from service.schemas import (
+    Assimilation,
+    ChannelState,
+    Retention,
+    RetentionRequest,
+    RevisedTwin,
+    Revision,
+    RevisionList,
+    Standing,
+    TwinDetail,
+    TwinInfo,
+    TwinList,
+)
+from service.store import anomalies, models, retention, twins
+from service.store.connection import Connection
 from service.store.twins import Twin
-from twin_core.network.spec_io import dump_spec, load_spec
 
 OF_READINGS = ("stuck", "quantised", "dropout")
 """Anomalies that the readings themselves show, whatever the model says."""
@@ -33,6 +48,7 @@ def _info(twin: Twin) -> dict[str, Any]:
         "last_time": _when(twin.last_us),
         "active_model": twin.active_version,
         "quarantined": twin.quarantined,
+        "revision": twin.revision,
         "seq": twin.seq,
         "channels": list(twin.channels),
     }
@@ -75,11 +91,11 @@ async def _telemetry(service: Service, twin: Entry, version: int | None) -> dict
     }
 
 
-@router.post("", status_code=201, dependencies=[operates])
-async def register(service: Running, response: Response, body: Annotated[dict[str, Any], Body()]) -> TwinDetail:
-    """Register a specification (201); the identical one again answers 200, another one under its id 409."""
-    spec = load_spec(body)
-    twin, is_new = await service.register(spec.twin, dump_spec(spec))
+@router.post("", status_code=201, dependencies=[operates], openapi_extra=BODY)
+async def register(service: Running, response: Response, request: Request) -> TwinDetail:
+    """Register a specification, JSON or YAML (201); the identical one again answers 200, another one under its id 409."""
+    given = await read_specification(request)
+    twin, is_new = await service.register(given)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
     return await _detail(service, twin)
@@ -95,6 +111,38 @@ async def list_twins(service: Running) -> TwinList:
 async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
     """Return one twin with its specification."""
     return await _detail(service, await service.database.read(twins.get, twin.name))
+
+
+@router.put("/{twin}", dependencies=[operates], openapi_extra=BODY)
+async def revise(service: Running, twin: NamedTwin, request: Request) -> RevisedTwin:
+    """Give the twin another specification (a new sensor, load or limit); archive and models stay.
+
+    The answer says which models still hold. A channel cannot be removed, nor change its kind or unit.
+    """
+    given = await read_specification(request)
+    if given.spec.twin != twin.name:
+        raise BadField("twin", f"is '{given.spec.twin}', the path names '{twin.name}'")
+    made, _ = await service.revise(twin, given)
+    detail = await _detail(service, made)
+    standing = await service.database.read(_standing, made)
+    return RevisedTwin(**detail.model_dump(), models=standing)
+
+
+def _standing(connection: Connection, twin: Twin) -> list[Standing]:
+    """Return of each model version what its specification and the twin's do not have in common."""
+    found = []
+    for row in models.select(connection, twin.key):
+        missing = lacks(models.document(connection, twin.key, row.version)["spec"], twin.specification)
+        found.append(Standing(version=row.version, active=row.active, holds=not missing, lacks=missing))
+    return found
+
+
+@router.get("/{twin}/revisions", dependencies=[reads])
+async def list_revisions(service: Running, twin: NamedTwin) -> RevisionList:
+    """List the former specifications, the newest first."""
+    rows = await service.database.read(twins.revisions, twin.key)
+    former = [Revision(number=n, until=format_instant(at_us), specification=text) for n, at_us, text in rows]
+    return RevisionList(current=twin.revision, revisions=former)
 
 
 @router.get("/{twin}/retention", dependencies=[reads])
