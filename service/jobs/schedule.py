@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from service.errors import Refusal
 from service.jobs.runner import LEAST_SAMPLES, Jobs
-from service.problems import Problem
 from service.registry import Entry, Registry
 from service.schemas import CalibrationRequest, DiagnosisRequest
 from service.store import anomalies, jobs, twins
@@ -93,7 +93,7 @@ class Schedule:
             for twin in self._registry:
                 try:
                     await self._look(twin, time.monotonic(), twin.key in refuted)
-                except Problem as error:
+                except Refusal as error:
                     log.info("no recalibration", extra={"twin": twin.name, "reason": error.detail})
 
     def _refuted(self) -> set[int]:
