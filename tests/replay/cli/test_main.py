@@ -16,7 +16,7 @@ COMMANDS = sorted(twin.commands)
 
 def test_the_commands() -> None:
     assert COMMANDS == [
-        *("backup", "calibrate", "check-effect", "close-loop", "demo", "forecast", "migrate"),
+        *("backup", "calibrate", "check-effect", "close-loop", "demo", "forecast", "import", "migrate"),
         *("record", "register", "replay", "restore", "serve", "simulate"),
     ]
 
