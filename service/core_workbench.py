@@ -92,14 +92,18 @@ class CoreWorkbench:
         return _outcome(model, {"rmse_K": model.summary.get("rmse_K"), "on": "its own training data"}, None)
 
     def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry."""
+        """Filter a stretch of telemetry; the state carries the evidence against the model along."""
+        from twin_core.anomaly.sufficiency import follow_evidence
         from twin_core.assimilate import assimilate
 
         model = _cached_model(document)
         done = assimilate(model, _record(model.spec, telemetry), state)
         if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
             raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
-        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
+        scaled = done.innovation_K / done.innovation_std_K
+        evidence, _ = follow_evidence((state or {}).get("evidence"), done.sensors, scaled)
+        after = done.state | {"evidence": evidence}
+        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, after)
 
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant."""
@@ -177,7 +181,11 @@ def _record(spec: Any, telemetry: Telemetry) -> Any:
     from twin_core.units import to_si
 
     time_s = (telemetry.time_us - telemetry.epoch_us) / 1e6
-    values = {name: to_si(column, spec.channels[name].unit) for name, column in telemetry.values.items()}
+    values = {
+        name: to_si(column, spec.channels[name].unit)
+        for name, column in telemetry.values.items()
+        if name in spec.channels
+    }
     return Record(time_s, values, telemetry.epoch_us * 1000, "archive")
 
 
@@ -186,7 +194,7 @@ def _screened(spec: Any, telemetry: Telemetry) -> tuple[Any, Telemetry]:
     from twin_core.network.screened import screened
 
     record = screened(spec, _record(spec, telemetry))
-    values = {name: np.where(np.isnan(record.values[name]), np.nan, v) for name, v in telemetry.values.items()}
+    values = {name: np.where(np.isnan(record.values[name]), np.nan, telemetry.values[name]) for name in record.values}
     return record, replace(telemetry, values=values)
 
 

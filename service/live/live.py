@@ -2,6 +2,7 @@
 
 import copy
 
+from service.http.problems import Problem
 from service.live import pulse as pulses
 from service.live.engine import Engine
 from service.live.limits import LimitWatch
@@ -9,7 +10,6 @@ from service.live.pulse import Beat, Pulse
 from service.live.scores import Scores
 from service.live.tracker import Tracker
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
@@ -28,8 +28,10 @@ class Live:
         workbench: MakeWorkbench,
         false_alarm_rate: float,
         limit_horizon_s: float,
+        window: int,
     ) -> None:
-        """Start without twins."""
+        """Start without twins; a new model follows at most the newest ``window`` samples of the past."""
+        self._window = window
         self.engine = Engine(workbench)
         self._database, self._hub, self._metrics = database, hub, metrics
         self._thresholds = Thresholds(false_alarm_rate)
@@ -42,7 +44,7 @@ class Live:
         """Begin to track a twin."""
         if twin.key not in self._trackers:
             rooms = (self._database, self._hub, self.engine, self._metrics)
-            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds)
+            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds, self._window)
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""
@@ -72,6 +74,11 @@ class Live:
     def find(self, twin: int) -> Tracker | None:
         """Return the tracker of a twin, None if nothing follows its samples."""
         return self._trackers.get(twin)
+
+    def evidence(self, twin: Entry) -> float | None:
+        """Return the greatest log evidence against the active model of a twin; None where nothing is followed."""
+        tracker = self._trackers.get(twin.key)
+        return None if tracker is None else tracker.evidence
 
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""

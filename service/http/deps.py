@@ -1,0 +1,159 @@
+"""What routes are handed: the running service, the twin that a path names, and proof of the caller's role.
+
+All of them are coroutines, although none waits: a plain function would be run in a thread, once per request each.
+"""
+
+import asyncio
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Path
+from fastapi.dependencies.models import Dependant
+from starlette.requests import HTTPConnection
+
+from service.errors import short
+from service.housekeeping import Housekeeping
+from service.http.keys import Role
+from service.http.problems import Problem
+from service.http.specification_body import Specified
+from service.intake import Intake
+from service.jobs import outcome
+from service.jobs.runner import Jobs
+from service.live.live import Live
+from service.metrics import Metrics
+from service.registry import Entry, Registry
+from service.settings import Settings
+from service.store import retention, twins
+from service.store.database import Database
+from service.store.errors import TwinGone
+from service.store.twins import Twin
+from service.streams import Hub
+from twin_core.network.spec import TwinSpec
+
+
+@dataclass
+class Service:
+    """Everything that lives as long as the application."""
+
+    settings: Settings
+    database: Database
+    registry: Registry
+    metrics: Metrics
+    hub: Hub
+    live: Live
+    intake: Intake
+    jobs: Jobs
+    housekeeping: Housekeeping
+    _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
+
+    def add_twin(self, twin: Twin, spec: TwinSpec | None = None) -> Entry:
+        """Let a stored twin take part in everything; its specification need not be checked again where it just was."""
+        entry = self.registry.add(twin)
+        if spec is not None:
+            entry.know(spec)
+        self.hub.open(entry.key, twin.seq)
+        if self.settings.assimilate:
+            self.live.add(entry)
+        self.live.arrived(entry)  # what the archive holds and nobody has looked at
+        return entry
+
+    async def register(self, given: Specified) -> tuple[Twin, bool]:
+        """Return the twin, and whether it is new; never between the steps of a deletion."""
+        async with self._coming_and_going:
+            twin, is_new = await self.database.write(twins.register, given.spec.twin, given.data)
+            self.add_twin(twin, given.spec if is_new else None)
+            return twin, is_new
+
+    async def revise(self, twin: Entry, given: Specified) -> tuple[Twin, bool]:
+        """Give a twin another specification; return it, and whether anything changed. Streams end and resume."""
+        async with self._coming_and_going:
+            if self.registry.get(twin.name) is not twin:
+                raise TwinGone(f"twin {twin.key} is gone")
+            made, is_new = await self.database.write(twins.revise, twin.name, given.data)
+            if is_new:
+                await self.live.remove(twin)
+                self.hub.close(twin.key)
+                entry = self.registry.replace(made)
+                entry.know(given.spec)
+                left = int(entry.sensors != twin.sensors)
+                while left:
+                    left = await self.database.write(retention.forget_derived, twin.key)
+                self.add_twin(made)
+                news = [("twin", {"revision": made.revision})]
+                await self.hub.write(twin.key, outcome.tell, twin.key, news)
+            return made, is_new
+
+    async def remove_twin(self, twin: Entry) -> None:
+        """Stop whatever concerns a twin, then delete it; Problem 404 if somebody else just did."""
+        async with self._coming_and_going:
+            if self.registry.get(twin.name) is not twin:
+                raise TwinGone(f"twin {twin.key} is gone")
+            self.registry.remove(twin.name)
+            await self.jobs.cancel_twin(twin)
+            await self.live.remove(twin)
+            await self.database.write(twins.delete, twin.name)
+            self.hub.close(twin.key)
+            self.housekeeping.wake()
+
+
+async def running_service(connection: HTTPConnection) -> Service:
+    """Return the service behind a request or web socket."""
+    service: Service = connection.app.state.service
+    return service
+
+
+Running = Annotated[Service, Depends(running_service)]
+
+
+def require(connection: HTTPConnection, role: Role) -> None:
+    """Refuse callers below a role (403)."""
+    if connection.scope["state"]["role"] < role:
+        raise Problem(403, f"this needs a key of role '{role.name}'")
+
+
+class Needs:
+    """A dependency that refuses callers below a role (403)."""
+
+    def __init__(self, role: Role) -> None:
+        """Remember the least role."""
+        self._role = role
+
+    async def __call__(self, connection: HTTPConnection) -> None:
+        """Check the role that the gate found."""
+        require(connection, self._role)
+
+
+reads = Depends(Needs(Role.read))
+operates = Depends(Needs(Role.operate))
+
+
+def refuse_unknown(connection: HTTPConnection, known: Collection[str] = ()) -> None:
+    """Refuse a query parameter that would be passed over: a slip in its name would go unnoticed (422)."""
+    if connection.scope["query_string"]:
+        errors = [(name, "unknown parameter") for name in connection.query_params if name not in known]
+        if errors:
+            expected = f"known: {', '.join(known)}" if known else "there are none"
+            raise Problem(422, f"{short(errors[0][0])}: unknown parameter ({expected})", errors)
+
+
+async def known_parameters(connection: HTTPConnection) -> None:
+    """Refuse query parameters that the route does not have."""
+    refuse_unknown(connection, _parameters(connection.scope["route"].dependant))
+
+
+def _parameters(dependant: Dependant) -> list[str]:
+    """Return the names of the query parameters of a route and of all that it depends on."""
+    inner = (name for part in dependant.dependencies for name in _parameters(part))
+    return [*(parameter.alias for parameter in dependant.query_params), *inner]
+
+
+TwinName = Annotated[str, Path(description="Id of a registered twin.")]
+
+
+async def named_twin(service: Running, twin: TwinName) -> Entry:
+    """Return the twin that the path names (404 if there is none)."""
+    return service.registry.get(twin)
+
+
+NamedTwin = Annotated[Entry, Depends(named_twin)]

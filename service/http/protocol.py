@@ -1,0 +1,79 @@
+"""Connections that open and then say too little, too slowly, or without end are closed: they would be kept for ever."""
+
+import asyncio
+from typing import Any, ClassVar
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from service.http.problems import MEDIA_TYPE, document
+
+MOST_HEAD_BYTES = 64 * 1024
+
+
+class PatientProtocol(HttpToolsProtocol):
+    """HTTP/1.1 whose request heads are short and complete within ``patience_s``; bodies have limits of their own."""
+
+    patience_s: ClassVar[float] = 30.0
+    _deadline: asyncio.TimerHandle | None = None
+    _head_bytes = 0
+    _in_body = False
+
+    def connection_made(self, transport: Any) -> None:
+        """Wait for the first request."""
+        super().connection_made(transport)
+        self._wait()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no more."""
+        self._stop()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Begin to wait with the first bytes of a later request: the keep-alive timer ends there."""
+        if not self._in_body:
+            self._head_bytes += len(data)
+            self._wait()
+        super().data_received(data)
+        if not self._in_body and self._head_bytes > MOST_HEAD_BYTES:
+            self.send_400_response(f"the head of a request must not exceed {MOST_HEAD_BYTES} bytes")
+
+    def on_message_begin(self) -> None:
+        """Wait for the rest of the head."""
+        super().on_message_begin()
+        self._wait()
+
+    def on_headers_complete(self) -> None:
+        """Wait no more: the head was complete. A request that names no host, or two, is none."""
+        hosts = sum(name == b"host" for name, _ in self.headers)
+        if hosts > 1 or (hosts == 0 and self.parser.get_http_version() == "1.1"):
+            raise ValueError("one Host is needed")  # the parser takes this for a malformed request
+        self._stop()
+        self._in_body = True
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """Expect the head of another request."""
+        self._in_body = False
+        super().on_message_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP as every other error is answered."""
+        body = document(400, msg)
+        head = f"content-type: {MEDIA_TYPE}\r\ncontent-length: {len(body)}\r\nconnection: close\r\n\r\n"
+        self.transport.write(b"HTTP/1.1 400 Bad Request\r\n" + head.encode() + body)
+        self.transport.close()
+
+    def _wait(self) -> None:
+        if self._deadline is None:
+            self._deadline = self.loop.call_later(self.patience_s, self.transport.close)
+
+    def _stop(self) -> None:
+        self._head_bytes = 0
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+
+def patient(patience_s: float) -> type[PatientProtocol]:
+    """Return the protocol with a patience of its own."""
+    return type("PatientProtocol", (PatientProtocol,), {"patience_s": patience_s})

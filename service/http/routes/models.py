@@ -1,0 +1,65 @@
+"""Model versions: list, inspect, activate, bring one along."""
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Path
+
+from service.fit import refuse_foreign
+from service.http.deps import NamedTwin, Running, operates, reads
+from service.jobs import outcome
+from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
+from service.store import models, retention
+from twin_core import __version__
+from twin_core.network.spec_io import load_spec
+
+router = APIRouter(prefix="/v1/twins/{twin}/models", tags=["models"])
+
+MOST_COMPARED = 30
+"""So many of the newest versions are compared over the same telemetry."""
+Version = Annotated[int, Path(ge=1, le=2**62, description="Number of a version.")]
+
+
+@router.get("", dependencies=[reads])
+async def list_models(service: Running, twin: NamedTwin) -> ModelList:
+    """List every version, the oldest first, and the log of activations."""
+    rows = await service.database.read(models.select, twin.key)
+    log = await service.database.read(models.activations, twin.key)
+    errors = await service.live.scores.of(twin, [row.version for row in rows][-MOST_COMPARED:])
+    return ModelList(
+        models=[ModelInfo(**row.wire() | {"error": errors.get(row.version)}) for row in rows],
+        activations=[Activation(**entry) for entry in log],
+    )
+
+
+@router.get("/{version}", dependencies=[reads])
+async def inspect(service: Running, twin: NamedTwin, version: Version) -> ModelDetail:
+    """Return one version with the model itself, as the command line reads it."""
+    row = await service.database.read(models.get, twin.key, version)
+    document = await service.database.read(models.document, twin.key, version)
+    return ModelDetail(**row.wire(), model=document)
+
+
+@router.post("/{version}/activate", dependencies=[operates])
+async def activate(service: Running, twin: NamedTwin, version: Version) -> ModelInfo:
+    """Make a version the active one: an upgrade or a roll-back."""
+    row = await service.hub.write(twin.key, outcome.activate, twin.key, version, "requested")
+    service.live.model_changed(twin.key)
+    return ModelInfo(**row.wire())
+
+
+@router.delete("/{version}", status_code=204, dependencies=[operates])
+async def delete(service: Running, twin: NamedTwin, version: Version) -> None:
+    """Delete a version that is not active, with its residuals and anomalies."""
+    await service.database.write(retention.delete_model, twin.key, version)
+    service.housekeeping.wake()
+
+
+@router.post("", status_code=201, dependencies=[operates])
+async def add(service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body()]) -> ModelInfo:
+    """Store a model that the command line made for this twin as a new version, not active."""
+    made = await service.live.inspect(body)
+    refuse_foreign(load_spec(made.document["spec"]), twin)
+    head = await service.database.read(models.first_us, twin.key)
+    provenance = {"code_version": __version__, "settings": {}, "epoch_us": head, "data_sha256": None, "parent": None}
+    row = await service.hub.write(twin.key, outcome.add_manual, twin.key, made, provenance)
+    return ModelInfo(**row.wire())
