@@ -407,8 +407,8 @@ class TwinSpec(Strict):
         A single one may yet be joined by what the closed loop finds; it is told among the doubts.
         """
         groups = {node.id: {node.id} for node in self.nodes}
-        for conductor in self.conductors:
-            one, other = (groups.get(end) for end in conductor.between)
+        for first, second in [*(c.between for c in self.conductors), *(r.between for r in self.radiation)]:
+            one, other = groups.get(first), groups.get(second)
             if one is not None and other is not None and one is not other:
                 one |= other
                 groups |= dict.fromkeys(other, one)
