@@ -159,8 +159,8 @@ def table(rows: Sequence[Row]) -> str:
     open_ = [row for row in good if "after" in row]
     leads = {state: sum(row[state]["leads"] for row in open_) for state in ("before", "after", "again")}
     sums = [
-        f"{len(open_)} of {len(good)} records leave open what is missing. The truth leads in {leads['before']} of these before, in"
-        f" {leads['after']} after the experiment, in {leads['again']} after one more record at rest."
+        f"{len(open_)} of {len(good)} records leave open what is missing. The truth leads in {leads['before']} of these before,"
+        f" in {leads['after']} after the experiment, in {leads['again']} after one more record at rest."
     ]
     header = ["hidden", "at rest", "experiment", "expected gain, bits", "after it", "after one more at rest"]
     failed = [f"Failed: {row['task']}: {row['error']}" for row in rows if "error" in row]

@@ -150,13 +150,13 @@ def plans(spec: TwinSpec, record: Record) -> Iterator[Plan]:
     span_s = float(np.ptp(record.time_s))
     yield Plan(f"a further {span_s:.0f} s like the last", record)
     boundaries = {b.channel: name for name, b in spec.boundaries.items() if b.channel is not None}
-    limited = any(spec.channels[name].limits is not None for name in spec.inputs if name in spec.channels)
+    limited = any(c.limits is not None for c in spec.channels.values() if c.kind != "temperature")
     sunlit = {load.channel for load in spec.loads if load.solar and load.table is None}
     for name, column in record.values.items():
         channel = spec.channels.get(name)
         if channel is None or not np.isfinite(column).any() or name in spec.sensors or name in sunlit:
             continue
-        if limited and channel.limits is None:
+        if limited and channel.limits is None and name not in boundaries:
             continue
         low, high = _range(spec, name, column)
         if name in boundaries:
