@@ -41,6 +41,7 @@ def march_sensitivities_of_many(
     samples = {int(k): np.flatnonzero(sample_step == k) for k in np.unique(sample_step)}
     mode, pushed = stages @ modes.inward.T, rate @ modes.inward.T
     pushed -= modes.rate_per_s * mode
+    fed, among = np.unique(entry_column, return_inverse=True)  # the columns of parameters; most may be initial states
     cells, place = np.unique(row * n + column, return_inverse=True)
     indices, pointers = cells % n, np.searchsorted(cells, np.arange(n + 1) * n)
     by_row = np.ascontiguousarray(turning.transpose(1, 0, 2))  # (n, n_turned, n)
@@ -60,10 +61,11 @@ def march_sensitivities_of_many(
             )
             for side in (0, 1)
         )
-        driven, reached = first @ state, np.zeros((n, n_columns))
+        driven, reached = first @ state, np.zeros((n, fed.size))
         np.add.at(driven, (entry_node, entry_column), entry_series[:, k, 0])
-        np.add.at(reached, (entry_node, entry_column), entry_series[:, k, 1])
-        work = dense_keep @ state + dense_early @ driven + dense_late @ reached
+        np.add.at(reached, (entry_node, among), entry_series[:, k, 1])
+        work = dense_keep @ state + dense_early @ driven
+        work[:, fed] += dense_late @ reached
         if turned.size > 0:
             mixed = divided[0] * mode[k, 0] + divided[1] * pushed[k, 0] + divided[2] * pushed[k, 1]
             mixed -= early[:, None] * mode[k, 0] + late[:, None] * mode[k, 1]

@@ -145,8 +145,8 @@ class _Switched:
         parameters = self.split.network.parameters
         shared, size = parameters.ties.get(index, (index, 1.0))
         found = np.flatnonzero(parameters.free_index == shared)
-        parameter = parameters.at_values(self.split.values).parameters[shared]
-        return (int(found[0]), size * parameter.transform.slope(parameter.free)) if found.size else (-1, 0.0)
+        slope = parameters.slope(shared, float(self.split.values[shared]))
+        return (int(found[0]), size * slope) if found.size else (-1, 0.0)
 
     @cached_property
     def _powers(self) -> list[tuple[int, float]]:

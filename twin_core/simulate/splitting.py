@@ -318,7 +318,6 @@ def turning(
     parameters, own = network.parameters, values[network.capacity_index]
     slope = split.slope_W_per_K(about_K)
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
-    at = parameters.at_values(values)
     along = probe(network, values, forcing, about_K)
     found: dict[int, FloatArray] = {}
     for number, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
@@ -352,6 +351,6 @@ def turning(
             change[node] = -size * mine[node] / own[node]
             found[shared] = found.get(shared, 0.0) + change
     turned = np.array([position[p] for p in found], dtype=np.int64)
-    slopes = [at.parameters[p].transform.slope(at.parameters[p].free) for p in found]
+    slopes = [parameters.slope(p, float(values[p])) for p in found]
     n = own.size
     return turned, np.array([s * change for s, change in zip(slopes, found.values(), strict=True)]).reshape(-1, n, n)
