@@ -15,7 +15,7 @@ COPY pyproject.toml README.md LICENSE ./
 COPY twin_core twin_core
 COPY service service
 COPY replay replay
-RUN pip install . && python -m compileall -q /opt/twin
+RUN pip install ".[neural]" && python -m compileall -q /opt/twin
 
 FROM python:3.11-slim
 RUN useradd --system --uid 10001 --home-dir /data --shell /usr/sbin/nologin twin \

@@ -19,7 +19,7 @@ FORMATS = ("xija", "esatan", "sinda")
     short_help="Turn a model of another tool into a specification.",
     example="twin import psmc_spec.json --channel 1pdeaat=T_box --hidden pin1at --out psmc.yaml",
 )
-@click.argument("file", type=FILE)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=FILE)
 @click.option("--out", required=True, type=FILE, help="Specification to write, .yaml or .json.")
 @click.option(
     "--format",
@@ -42,7 +42,7 @@ FORMATS = ("xija", "esatan", "sinda")
 @click.option("--skip-unknown", is_flag=True, help="Write what was understood, and list what was not.")
 @click.option("--json", "as_json", is_flag=True, help="Print notes and refusals as JSON.")
 def import_model(
-    file: Path,
+    files: tuple[Path, ...],
     out: Path,
     kind: str | None,
     channels: tuple[str, ...],
@@ -63,10 +63,12 @@ def import_model(
 
     if out.suffix not in (".yaml", ".yml", ".json"):
         raise click.UsageError(f"--out {out} must end in .yaml or .json")
-    text = _text(file)
-    found = _read(
-        kind or _told(file, text), file, text, _pairs(channels, "channel"), _pairs(constants, "constant"), hidden, held
-    )
+    texts = {file: _text(file) for file in files}
+    kind = kind or _told(files[0], texts[files[0]])
+    if kind != "sinda" and len(files) > 1:
+        raise click.UsageError(f"{files[1]}: only a SINDA deck has several files")
+    columns, values = _pairs(channels, "channel"), _pairs(constants, "constant")
+    found = _read(kind, texts, columns, values, hidden, held)
     refused = list(found.refused)
     if refused and not skip_unknown:
         raise SpecError(
@@ -108,13 +110,13 @@ def _pairs(given: tuple[str, ...], option: str) -> dict[str, str]:
 
 def _read(
     kind: str,
-    file: Path,
-    text: str,
+    texts: dict[Path, str],
     channels: dict[str, str],
     constants: dict[str, str],
     hidden: tuple[str, ...],
     held: bool,
 ) -> "Imported":
+    file, text = next(iter(texts.items()))
     if kind == "xija":
         from twin_core.interchange.xija import read_xija
 
@@ -125,7 +127,13 @@ def _read(
         return read_xija(text, str(file), channels=channels, constants=values, hidden=hidden, held=held)
     if constants or hidden:
         raise click.UsageError("--constant and --hidden belong to Xija models")
-    raise click.UsageError(f"{kind} models cannot be read yet")
+    if kind == "esatan":
+        from twin_core.interchange.esatan import read_esatan
+
+        return read_esatan(text, str(file), channels=channels, held=held)
+    from twin_core.interchange.sinda import read_sinda
+
+    return read_sinda({str(name): deck for name, deck in texts.items()}, channels=channels, held=held)
 
 
 def _write(out: Path, found: "Imported") -> None:

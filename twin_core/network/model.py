@@ -108,9 +108,13 @@ class Layout:
 
     def node(self, name: str) -> int:
         """Return the position of a node; ModelError if there is none of that name."""
-        if name not in self.nodes:
+        if name not in self._node_index:
             raise ModelError(f"unknown node '{name}' (known: {', '.join(self.nodes)})")
-        return self.nodes.index(name)
+        return self._node_index[name]
+
+    @cached_property
+    def _node_index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.nodes)}
 
     def boundary(self, name: str) -> int:
         """Return the position of a boundary; ModelError if there is none of that name."""
@@ -126,7 +130,11 @@ class Layout:
 
     def sensor_node(self, name: str) -> str:
         """Return the node that a sensor reads."""
-        return next(node.id for node in self.spec.nodes if name in node.sensors)
+        return self._sensor_nodes[name]
+
+    @cached_property
+    def _sensor_nodes(self) -> dict[str, str]:
+        return {sensor: node.id for node in self.spec.nodes for sensor in node.sensors}
 
     @property
     def declared_nodes(self) -> tuple[str, ...]:
@@ -379,8 +387,9 @@ def _conductance(conductor: Conductor) -> Parameter:
 
 def _radiation_terms(layout: Layout) -> Iterator[Term]:
     """Yield the declared radiation: between nodes as one term, to each boundary as one of its own."""
-    outer = [r for r in layout.spec.radiation if set(r.between) & set(layout.boundaries)]
-    inner = [r for r in layout.spec.radiation if r not in outer]
+    sinks = set(layout.boundaries)
+    outer = [r for r in layout.spec.radiation if sinks & set(r.between)]
+    inner = [r for r in layout.spec.radiation if not sinks & set(r.between)]
     parameters = {r.name: _quantity(r.name, "m2", r.area_m2, 1e-3) for r in layout.spec.radiation}
     if inner:
         pairs = tuple((layout.node(r.between[0]), layout.node(r.between[1])) for r in inner)

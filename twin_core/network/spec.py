@@ -385,6 +385,7 @@ class TwinSpec(Strict):
         if not seen:
             yield "nodes: none has a sensor; name the temperature channel of at least one node"
         yield from self._check_conductors(nodes)
+        yield from self._check_unseen()
         for i, radiator in enumerate(self.radiators):
             yield from self._check_end(f"radiators[{i}].node", radiator.node, nodes)
             yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
@@ -399,6 +400,23 @@ class TwinSpec(Strict):
         for sensor in self.criteria.per_sensor:
             if sensor not in seen:
                 yield f"criteria.per_sensor.{sensor}: reads no node (sensors: {', '.join(seen) or 'none'})"
+
+    def _check_unseen(self) -> Iterable[str]:
+        """Refuse hidden nodes that are joined with one another and with no node that is read: no data tell anything of them.
+
+        A single one may yet be joined by what the closed loop finds; it is told among the doubts.
+        """
+        groups = {node.id: {node.id} for node in self.nodes}
+        for first, second in [*(c.between for c in self.conductors), *(r.between for r in self.radiation)]:
+            one, other = groups.get(first), groups.get(second)
+            if one is not None and other is not None and one is not other:
+                one |= other
+                groups |= dict.fromkeys(other, one)
+        read = {node.id for node in self.nodes if node.sensors}
+        for group in {id(group): group for group in groups.values()}.values():
+            if len(group) > 1 and not group & read:
+                names = ", ".join(sorted(group)[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
+                yield f"nodes: no sensor sees {names}: join one of them to a node with a sensor, or remove them"
 
     def _check_shared(self) -> Iterable[str]:
         """Check the shared unknowns: each is used, by quantities of one kind, and has a size to start from."""
