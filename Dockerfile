@@ -13,6 +13,7 @@ RUN pip install --index-url "$TORCH_INDEX" --extra-index-url https://pypi.org/si
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
 COPY twin_core twin_core
+COPY thermal_twin thermal_twin
 COPY service service
 COPY replay replay
 RUN pip install ".[neural]" && python -m compileall -q /opt/twin

@@ -357,6 +357,12 @@ class TwinSpec(Strict):
     heaters: tuple[Heater, ...] = ()
     derived: dict[Name, Derived] = Field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Tell what it declares in one line."""
+        couplings = len(self.conductors) + len(self.radiators) + len(self.radiation)
+        sensors = ", ".join(self.sensors[:5]) + (", ..." if len(self.sensors) > 5 else "")
+        return f"<TwinSpec {self.twin}: {len(self.nodes)} nodes, {couplings} couplings, sensors {sensors}>"
+
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
         problems = list(dict.fromkeys(self._problems()))
