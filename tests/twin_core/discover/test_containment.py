@@ -19,7 +19,7 @@ from twin_core.discover.search import search
 from twin_core.errors import TelemetryError
 
 SOLVERS = (
-    *(f"numpy.linalg.{name}" for name in ("solve", "svd", "cholesky", "pinv", "eigh")),
+    *(f"numpy.linalg.{name}" for name in ("solve", "svd", "pinv", "eigh")),
     "twin_core.calibrate.optimise.cho_factor",
     "twin_core.calibrate.optimise.cho_solve",
     "twin_core.gp.noise_model.minimize",
