@@ -17,6 +17,7 @@ from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
+from twin_core.discover.mistakes import told_mistakes
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
@@ -141,6 +142,7 @@ def _close_loop(
     progress(0.93, "drawing")
     witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)
+    report |= told_mistakes(found, report, deadline=latest)
     plots = build_plots(found, before, after, held, predictions, report, witness)
     report["quality"] = quality_json([*records, *holdout_records])
     plots["quality_strip"] = quality_strip([*records, *holdout_records])
@@ -193,6 +195,16 @@ def _split(
         raise TelemetryError(
             f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
         )
+    given = {b.channel for b in spec.boundaries.values() if b.channel is not None} | {
+        load.channel for load in spec.loads
+    }
+    for part in (part for h in held for part in (h.lead, h.scored)):
+        for name in sorted(given & part.values.keys()):
+            if not np.isfinite(part.values[name]).any():
+                raise TelemetryError(
+                    f"{part.name}: channel '{name}' has no samples in the hold-out, and the model needs it as an input;"
+                    " choose another hold-out, or give them"
+                )
     return train, held
 
 
