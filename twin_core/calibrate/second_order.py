@@ -66,6 +66,18 @@ class Calibration:
         return self.problem.network.with_values(self.problem.values(self.optimum.unknowns))
 
     @property
+    def log_posterior(self) -> float:
+        """Log-likelihood of the residuals under their own coloured noise, less what priors hold against the parameters.
+
+        Initial temperatures are fitted here: each pays its Schwarz penalty, so that the value stands beside likelihoods
+        that are averaged over them.
+        """
+        mean, std = self.problem.prior()
+        against = 0.5 * float((((self.optimum.unknowns - mean) / std) ** 2).sum())
+        starts = self.problem.n_unknowns - self.problem.n_free
+        return self.whitener.log_likelihood - against - 0.5 * starts * float(np.log(self.problem.n_samples))
+
+    @property
     def residuals(self) -> list[FloatArray]:
         """Measured minus modelled per segment."""
         return self.problem.residuals(self.optimum.fit)

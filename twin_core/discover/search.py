@@ -198,7 +198,7 @@ def _judge(
         try_effects(start, (*state.trial.effects, *option), n_passes=n_passes, quick=quick), simpler=state.trial
     )
     found = trial.effects[len(state.trial.effects) :]
-    return Judged(found, weigh(state.trial, trial, n_tried), trial)
+    return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)
 
 
 def prune(state: Search, needed: float) -> None:
