@@ -118,15 +118,14 @@ class Trial:
         """What :attr:`log_evidence` is at least, from wandering heat alone: open-loop trajectories need not be computed."""
         return self.fit.log_posterior - LN_2
 
-    @property
-    def excess(self) -> float:
-        """Part of the variance of the open-loop residuals that is beyond the sensor's noise, at the worst sensor."""
+    @cached_property
+    def excess(self) -> FloatArray:
+        """Variance of each sensor's open-loop residuals beyond its own noise, in units of that noise, (n_sensors,)."""
         calibration = self.calibration
-        noise = [
-            min(m.sigma_white, n) for m, n in zip(calibration.whitener.models, calibration.problem.noise_K, strict=True)
-        ]
-        square = np.nanmean((np.concatenate(calibration.residuals) / np.maximum(noise, 1e-300)) ** 2, axis=0)
-        return float(1.0 - 1.0 / max(float(np.nanmax(square)), 1.0))
+        white = np.array([model.sigma_white for model in calibration.whitener.models])
+        noise = np.maximum(np.minimum(white, calibration.problem.noise_K), 1e-300)
+        square = np.nanmean((np.concatenate(calibration.residuals) / noise) ** 2, axis=0)
+        return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
 
     @property
     def n_samples(self) -> int:

@@ -13,7 +13,7 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
-from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
+from twin_core.discover.judge import NO_MORE, Judged, Search, accept, mean_excess, once_each, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
@@ -37,7 +37,14 @@ DOUBTFUL = 0.8
 """Foresight from which a finding of the innovations is held against what open-loop residuals suggest: the better one counts."""
 
 LEAST_EXCESS = 0.1
-"""Part of the variance of open-loop residuals that must be beyond the noise, at one sensor at least: else nothing is missing."""
+"""Variance of open-loop residuals beyond the noise, in units of that noise, at one sensor at least: else nothing is missing."""
+
+DOMINANCE = 3.0
+"""A name must explain so many times the variance that stays unexplained, as far as a lumped network may leave that."""
+
+COARSEST = 4.0
+"""Variance, in units of the sensors' noise, up to which what stays unexplained may be a lumped network's coarseness: a misfit
+of two noises."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -74,15 +81,17 @@ def search(
         if not _extend(state, needed, fallback=False):
             break
         prune(state, needed)
+    withdraw(state)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
+        withdraw(state)
     return state
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: state.trial.excess < LEAST_EXCESS, "how well trajectories fit"):
+    if state.attempt(lambda: bool(state.trial.excess.max() < LEAST_EXCESS), "how well trajectories fit"):
         return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
@@ -199,6 +208,28 @@ def _judge(
     )
     found = trial.effects[len(state.trial.effects) :]
     return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)
+
+
+def withdraw(state: Search) -> None:
+    """Withdraw findings that explain no more than what stays unexplained: both may be what a lumped network cannot follow.
+
+    Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
+    counts as unexplained.
+    """
+    while state.findings:
+        left = DOMINANCE * min(mean_excess(state.trial), COARSEST)
+        weakest = min(state.findings, key=lambda finding: finding.explained)
+        if weakest.explained >= left:
+            return
+        state.findings = [finding for finding in state.findings if finding is not weakest]
+        state.rejected.append(replace(weakest.judged, reason=NO_MORE))
+        places = {effect.place for effect in weakest.effects}
+        others = [effect for effect in state.trial.effects if effect.place not in places]
+        work = partial(try_effects, state.trial, others, n_passes=10)
+        kept = state.attempt(work, "the model without what explains no more than what stays") if others else state.base
+        if kept is None:
+            state.findings, kept = [], state.base
+        state.trial = kept
 
 
 def prune(state: Search, needed: float) -> None:
