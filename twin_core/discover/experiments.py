@@ -73,7 +73,7 @@ def separating(finding: Finding) -> list[Experiment]:
     if not rivals:
         return []
     own = finding.judged.trial
-    record = own.calibration.problem.segments[-1].record
+    record = own.calibration().problem.segments[-1].record
     found = []
     for words, moved in _plans(own, record):
         parted = [_apart(own, rival, words, moved) for rival in rivals]
@@ -112,7 +112,7 @@ def _apart(own: Trial, rival: Trial, words: str, record: Record) -> Experiment |
     pair = [_readings_K(trial, record) for trial in (own, rival)]
     if not all(np.isfinite(readings).all() for readings in pair):
         return None
-    noise = own.calibration.problem.noise_K
+    noise = own.calibration().problem.noise_K
     apart = np.sqrt(np.mean((pair[0] - pair[1]) ** 2, axis=0))
     at = int(np.argmax(apart / noise))
     return Experiment(words, own.fit.network.spec.sensors[at], float(apart[at]), float(apart[at] / noise[at]))
@@ -120,7 +120,7 @@ def _apart(own: Trial, rival: Trial, words: str, record: Record) -> Experiment |
 
 def _readings_K(trial: Trial, record: Record) -> FloatArray:
     """Return the readings over a record that begins where the last segment of training did, (n_samples, n_sensors)."""
-    network, optimum = trial.calibration.network, trial.calibration.optimum
+    network, optimum = trial.calibration().network, trial.calibration().optimum
     values = network.parameters.values
     forcing: Forcing = build_forcing(network, record, trial.max_step_s)
     path = rollout(network, values, optimum.fit.trajectories[-1].start_K, forcing)

@@ -197,7 +197,7 @@ def most_left(log_bayes_factor: float, needed: float) -> float:
 
 def mean_excess(trial: Trial) -> float:
     """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
-    return float(np.mean(trial.excess))
+    return float(np.mean(trial.excess()))
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

@@ -143,7 +143,7 @@ def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
 
 def corrected(found: Search) -> CalibratedModel:
     """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
-    return centred(to_model(found.trial.calibration, found.trial.present_effects), found.trial.fit)
+    return centred(to_model(found.trial.calibration(), found.trial.present_effects), found.trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:
@@ -182,5 +182,5 @@ def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    unexplained = found.base.misfit_share > UNEXPLAINED_SHARE
+    unexplained = found.base.misfit_share() > UNEXPLAINED_SHARE
     return "unexplained" if unexplained else "no_effect_supported"

@@ -91,7 +91,7 @@ def search(
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: bool(state.trial.excess.max() < LEAST_EXCESS), "how well trajectories fit"):
+    if state.attempt(lambda: bool(state.trial.excess().max() < LEAST_EXCESS), "how well trajectories fit"):
         return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:

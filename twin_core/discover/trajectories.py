@@ -45,7 +45,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
     fallback
         Whether to try the effects without a name.
     """
-    misfit = state.trial.misfit_share
+    misfit = state.trial.misfit_share()
     if misfit < LEAST_MISFIT_SHARE:
         return False
     seeds = [state.trial]
@@ -63,7 +63,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
 
 def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fallback: bool) -> list[Judged]:
     """Return what one more effect makes of a trial, judged against the state's model."""
-    calibration = seed.calibration
+    calibration = seed.calibration()
     fit = about_trajectory(calibration.problem, calibration.optimum)
     screenings = screened(seed, fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
