@@ -8,22 +8,26 @@ from typing import Any
 
 from fastapi import Depends, FastAPI
 
-from service import problems
-from service.access import Gate
-from service.bodies import Bodies
 from service.core_workbench import CoreWorkbench
-from service.deps import Service, known_parameters
-from service.heads import Heads
+from service.dispatch import Dispatch
 from service.housekeeping import Housekeeping
+from service.http import problems
+from service.http.audit import Audit
+from service.http.auth import Gate
+from service.http.body_limit import Bodies
+from service.http.deps import Service, known_parameters
+from service.http.head import Heads
+from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
+from service.http.shortcut import Shortcut
 from service.intake import Intake
+from service.jobs.executor import ProcessPerTask
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
+from service.live.silence import Silence
 from service.metrics import Metrics, Observe
 from service.registry import Registry
-from service.routes import alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.settings import Settings, read_settings
-from service.shortcut import Shortcut
 from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
@@ -42,6 +46,8 @@ ROUTERS = (
     live.router,
     alarms.router,
     streams.router,
+    admin.audit,
+    admin.webhooks,
 )
 
 
@@ -54,21 +60,33 @@ async def _running(
     if interrupted:
         log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
     hub = Hub(database, metrics, settings.stream_buffer)
-    live_state = Live(database, hub, metrics, workbench, settings.false_alarm_rate, settings.limit_horizon_s)
-    runner = Jobs(
-        database, hub, metrics, workbench, settings.job_workers, settings.job_deadline_s, live_state.model_changed
+    live_state = Live(
+        database,
+        hub,
+        metrics,
+        workbench,
+        settings.false_alarm_rate,
+        settings.limit_horizon_s,
+        settings.assimilate_samples,
     )
+    executor = ProcessPerTask(settings.job_workers, settings.job_deadline_s, settings.job_memory_mib)
+    rooms = (database, hub, metrics, workbench, executor)
+    runner = Jobs(*rooms, settings.job_workers, settings.job_values, live_state.model_changed)
     intake = Intake(hub, live_state, metrics, settings.clock_tolerance_s)
-    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner)
+    housekeeping = Housekeeping(database)
+    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner, housekeeping)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
-    housekeeping = Housekeeping(database)
+    dispatch = Dispatch(database)
+    silence = Silence(service.registry, live_state, hub)
     schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
     try:
         yield service
     finally:
         hub.close()
+        await silence.close()
         await schedule.close()
+        await dispatch.close()
         await housekeeping.close()
         await runner.close()
         await live_state.close()
@@ -102,6 +120,7 @@ def create_app(
     settings = settings or read_settings()
     make_workbench = workbench or partial(CoreWorkbench, settings.effect_files)
     metrics = Metrics()
+    keys = settings.keys
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -132,7 +151,9 @@ def create_app(
         app.mount(path, files, name=path)
     app.add_middleware(Shortcut, route=telemetry.ingesting)
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
-    app.add_middleware(Gate, keys=settings.roles)
+    app.state.keys = keys
+    app.add_middleware(Gate, keys=keys)
+    app.add_middleware(Audit)
     app.add_middleware(Observe, metrics=metrics)
     app.add_middleware(Heads)
     return app

@@ -1,6 +1,5 @@
 """Changes of the archive that are not ingest: deletions, undone ones, samples that leave quarantine. The stream hears of them."""
 
-import sqlite3
 from collections.abc import Sequence
 
 from service.instants import now_us
@@ -9,18 +8,19 @@ from service.messages import EventStretch, Stretch
 from service.registry import Entry
 from service.store import aside, events
 from service.store.aside import Deletion
+from service.store.connection import Connection
 from service.store.samples import Receipt
 
 
 def delete(
-    connection: sqlite3.Connection, twin: Entry, start_us: int | None, stop_us: int | None, channels: list[str] | None
+    connection: Connection, twin: Entry, start_us: int | None, stop_us: int | None, channels: list[str] | None
 ) -> tuple[Deletion, Sequence[Stretch]]:
     """Take a part of the archive out for a day."""
     made = aside.delete(connection, twin.key, twin.channels, start_us, stop_us, channels)
     return made, _news(connection, twin, {"deleted": made.wire()})
 
 
-def undo(connection: sqlite3.Connection, twin: Entry, number: int) -> tuple[Deletion, Sequence[Stretch]]:
+def undo(connection: Connection, twin: Entry, number: int) -> tuple[Deletion, Sequence[Stretch]]:
     """Put back what a deletion took; what came meanwhile stays as it is."""
     made, back = aside.undo(connection, twin.key, len(twin.channels), number)
     _, stretches = take_in(connection, twin, back, 0)
@@ -28,7 +28,7 @@ def undo(connection: sqlite3.Connection, twin: Entry, number: int) -> tuple[Dele
 
 
 def release(
-    connection: sqlite3.Connection, twin: Entry, start_us: int | None, stop_us: int | None
+    connection: Connection, twin: Entry, start_us: int | None, stop_us: int | None
 ) -> tuple[Receipt, Sequence[Stretch]]:
     """Let samples out of quarantine into the archive."""
     found = aside.release(connection, twin.key, len(twin.channels), start_us, stop_us)
@@ -36,5 +36,5 @@ def release(
     return receipt, [*stretches, *_news(connection, twin, {"released": int(found.time_us.size)})]
 
 
-def _news(connection: sqlite3.Connection, twin: Entry, body: dict[str, object]) -> list[Stretch]:
+def _news(connection: Connection, twin: Entry, body: dict[str, object]) -> list[Stretch]:
     return [EventStretch(tuple(events.append(connection, twin.key, now_us(), [("telemetry", body)])))]

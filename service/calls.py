@@ -48,6 +48,11 @@ def register(specification: Mapping[str, Any]) -> Call[schemas.TwinDetail]:
     return Call("POST", "/v1/twins", schemas.TwinDetail, body=dict(specification))
 
 
+def revise(name: str, specification: Mapping[str, Any]) -> Call[schemas.RevisedTwin]:
+    """Give a twin another specification; the same one again changes nothing."""
+    return Call("PUT", f"/v1/twins/{name}", schemas.RevisedTwin, body=dict(specification))
+
+
 def delete(name: str) -> Call[Nothing]:
     """Delete a twin."""
     return Call("DELETE", f"/v1/twins/{name}", Nothing, repeatable=False)

@@ -159,6 +159,10 @@ class TwinClient:
         """Register a specification."""
         return self.send(calls.register(specification))
 
+    def revise(self, name: str, specification: Mapping[str, Any]) -> schemas.RevisedTwin:
+        """Give a twin another specification; the answer says which models still hold."""
+        return self.send(calls.revise(name, specification))
+
     def delete(self, name: str) -> None:
         """Delete a twin with its archive and models."""
         self.send(calls.delete(name))

@@ -177,7 +177,11 @@ def _record(spec: Any, telemetry: Telemetry) -> Any:
     from twin_core.units import to_si
 
     time_s = (telemetry.time_us - telemetry.epoch_us) / 1e6
-    values = {name: to_si(column, spec.channels[name].unit) for name, column in telemetry.values.items()}
+    values = {
+        name: to_si(column, spec.channels[name].unit)
+        for name, column in telemetry.values.items()
+        if name in spec.channels
+    }
     return Record(time_s, values, telemetry.epoch_us * 1000, "archive")
 
 
@@ -186,7 +190,7 @@ def _screened(spec: Any, telemetry: Telemetry) -> tuple[Any, Telemetry]:
     from twin_core.network.screened import screened
 
     record = screened(spec, _record(spec, telemetry))
-    values = {name: np.where(np.isnan(record.values[name]), np.nan, v) for name, v in telemetry.values.items()}
+    values = {name: np.where(np.isnan(record.values[name]), np.nan, telemetry.values[name]) for name in record.values}
     return record, replace(telemetry, values=values)
 
 

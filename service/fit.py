@@ -1,8 +1,13 @@
 """Whether a model that was made elsewhere fits a twin: its filter reads the archive by name, in the declared units."""
 
-from service.problems import BadField
+from collections.abc import Callable
+from typing import Any
+
+from service.errors import BadField
 from service.registry import Entry
 from twin_core.network.spec import Node, TwinSpec
+
+Json = dict[str, Any]
 
 
 def refuse_foreign(model: TwinSpec, twin: Entry) -> None:
@@ -14,6 +19,43 @@ def refuse_foreign(model: TwinSpec, twin: Entry) -> None:
         raise BadField("spec.twin", f"is '{model.twin}', must be '{twin.name}'")
     _compare_channels(model, twin.spec)
     _compare_nodes(model.nodes, twin.spec.nodes)
+
+
+def lacks(model: Json, declared: Json) -> list[str]:
+    """Return what two specifications do not have in common that shapes temperatures, in words; limits and guesses do not.
+
+    Parameters
+    ----------
+    model, declared
+        The specification that a model was made from, and the twin's as it is now.
+    """
+    found = []
+    for what, parts in _PARTS.items():
+        ours, own = parts(model), parts(declared)
+        found += [f"{what} {name} is new" for name in sorted(own.keys() - ours.keys())]
+        found += [f"{what} {name} is gone" for name in sorted(ours.keys() - own.keys())]
+        found += [f"{what} {name} has changed" for name in sorted(ours.keys() & own.keys()) if ours[name] != own[name]]
+    return found
+
+
+def _sensors(spec: Json) -> dict[str, Any]:
+    def read(node: Json) -> list[str]:
+        sensors = node.get("sensor") or []
+        return [sensors] if isinstance(sensors, str) else sensors
+
+    return {sensor: node["id"] for node in spec["nodes"] for sensor in read(node)}
+
+
+_PARTS: dict[str, Callable[[Json], dict[str, Any]]] = {
+    "sensor": _sensors,
+    "node": lambda spec: {node["id"]: None for node in spec["nodes"]},
+    "boundary": lambda spec: {name: (b or {}).get("channel") for name, b in (spec.get("boundaries") or {}).items()},
+    "conductor": lambda spec: {" – ".join(sorted(c["between"])): None for c in spec.get("conductors") or ()},
+    "radiator": lambda spec: {
+        f"{r['node']} → {r['sink']}": (r["emissivity"], r["area_m2"]) for r in spec.get("radiators") or ()
+    },
+    "load": lambda spec: {f"{c['channel']} → {c['node']}": c.get("weight") for c in spec.get("loads") or ()},
+}
 
 
 def _compare_channels(model: TwinSpec, declared: TwinSpec) -> None:

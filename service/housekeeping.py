@@ -1,25 +1,39 @@
-"""What has had its day is forgotten, now and then."""
+"""What has had its day is removed, in short writes between which everybody else has a turn."""
 
 import asyncio
 import contextlib
 import logging
+from collections.abc import Callable
 
-from service.problems import Problem
-from service.store import aside
+from service.errors import Refusal
+from service.store import aside, retention
+from service.store.connection import Connection
 from service.store.database import Database
 
 log = logging.getLogger("service")
 
 EVERY_S = 600.0
+PAUSE_S = 0.01
+CHORES: tuple[tuple[str, Callable[[Connection], int]], ...] = (
+    ("deleted samples that can no longer be restored", aside.expire),
+    ("twins that were deleted", retention.sweep_gone),
+    ("what is older than its twin keeps", retention.sweep_old),
+    ("free pages", retention.vacuum),
+)
 
 
 class Housekeeping:
-    """Forgets deleted samples once their deletion can no longer be undone."""
+    """Does the chores at the start, now and then, and when it is woken."""
 
     def __init__(self, database: Database) -> None:
         """Begin at once."""
         self._database = database
+        self._wake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
+
+    def wake(self) -> None:
+        """Hear that there is something to do."""
+        self._wake.set()
 
     async def close(self) -> None:
         """Stop."""
@@ -29,10 +43,22 @@ class Housekeeping:
 
     async def _run(self) -> None:
         while True:
-            try:
-                gone = await self._database.write(aside.expire)
-                if gone:
-                    log.info("deleted samples are gone for ever", extra={"n": gone})
-            except Problem as error:
-                log.warning("deleted samples are still there", extra={"reason": error.detail})
-            await asyncio.sleep(EVERY_S)
+            self._wake.clear()
+            for what, chore in CHORES:
+                try:
+                    await self._finish(what, chore)
+                except Exception as error:  # the next time may be a better one
+                    reason = error.detail if isinstance(error, Refusal) else f"{type(error).__name__}: {error}"
+                    log.warning("housekeeping was interrupted", extra={"chore": what, "reason": reason})
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(EVERY_S):
+                    await self._wake.wait()
+
+    async def _finish(self, what: str, chore: Callable[[Connection], int]) -> None:
+        """Do a chore until there is nothing left to do."""
+        removed = 0
+        while done := await self._database.write(chore):
+            removed += done
+            await asyncio.sleep(PAUSE_S)
+        if removed:
+            log.info("removed for ever", extra={"what": what, "rows": removed})

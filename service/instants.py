@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.problems import BadField
+from service.errors import BadField
 
 Instants = NDArray[np.int64]
 

@@ -5,7 +5,6 @@ What a commit costs beside the disk (statements, hand-overs between threads) is 
 
 import asyncio
 import logging
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -14,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from service.frames import MOST_VALUES, Batch
 from service.instants import now_us
 from service.live.live import Live
 from service.messages import SampleStretch
@@ -22,6 +20,8 @@ from service.metrics import Metrics
 from service.registry import Entry
 from service.store import samples
 from service.store.admission import admit
+from service.store.batch import MOST_VALUES, Batch
+from service.store.connection import Connection
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Receipt
 from service.streams import Hub, settle
@@ -103,11 +103,11 @@ def _joined(batches: list[Batch]) -> Batch:
     """Return batches as one, in their order."""
     if len(batches) == 1:
         return batches[0]
-    return samples.joined(batches, batches[0].values.shape[0])
+    return samples.joined(batches, max(batch.values.shape[0] for batch in batches))
 
 
 def take_in(
-    connection: sqlite3.Connection, twin: Entry, batch: Batch, tolerance_us: int
+    connection: Connection, twin: Entry, batch: Batch, tolerance_us: int
 ) -> tuple[Receipt, Sequence[SampleStretch]]:
     """Store a batch; return what became of it, and what the stream hears. A tolerance of 0 takes in what lies ahead, too."""
     receipt = admit(connection, twin.key, batch, tolerance_us)

@@ -1,11 +1,14 @@
 """Structured logs: one JSON object per line on stderr, never a key or a body."""
 
 import logging
+import re
 import sys
 from datetime import UTC, datetime
 
 import orjson
 
+_QUERY = re.compile(r"\?[^\s\"']+")
+"""A query in a line of the HTTP server may hold a key."""
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 
 
@@ -14,11 +17,12 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
+        message = record.getMessage()
         entry = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": record.getMessage(),
+            "message": _QUERY.sub("?…", message) if record.name.startswith("uvicorn") else message,
         }
         entry |= {name: value for name, value in record.__dict__.items() if name not in _STANDARD}
         if record.exc_info:

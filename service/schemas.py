@@ -52,6 +52,7 @@ class TwinInfo(_Answer):
     last_time: Instant | None
     active_model: int | None
     quarantined: int = 0
+    revision: int = 1
     seq: int
     channels: list[str]
 
@@ -59,6 +60,7 @@ class TwinInfo(_Answer):
 class Assimilation(_Answer):
     """How far the active model has followed the archive: ``done`` of ``of`` samples, the rest in the background.
 
+    ``since`` is where the part of the archive begins that is followed, null: all of it (``TWIN_ASSIMILATE_SAMPLES``);
     ``state_time`` is the instant of the present state, ``behind_s`` by how many seconds of telemetry that lies before the
     last sample.
     """
@@ -67,6 +69,7 @@ class Assimilation(_Answer):
     of: int
     state_time: Instant | None
     behind_s: float
+    since: Instant | None = None
 
 
 class ChannelState(_Answer):
@@ -97,6 +100,36 @@ class TwinDetail(TwinInfo):
     assimilation: Assimilation | None = None
     telemetry: dict[str, ChannelState] = {}
     specification: dict[str, Any]
+
+
+class Standing(_Answer):
+    """Whether a model version still holds: ``lacks`` says what its specification and the twin's do not have in common."""
+
+    version: int
+    active: bool
+    holds: bool
+    lacks: list[str]
+
+
+class RevisedTwin(TwinDetail):
+    """A twin after its specification was changed."""
+
+    models: list[Standing]
+
+
+class Revision(_Answer):
+    """A former specification, and until when it held."""
+
+    number: int
+    until: Instant
+    specification: dict[str, Any]
+
+
+class RevisionList(_Answer):
+    """The former specifications of a twin, the newest first; ``current`` is the number of the present one."""
+
+    current: int
+    revisions: list[Revision]
 
 
 class TwinList(_Answer):
@@ -161,6 +194,102 @@ class Quarantine(_Answer):
     values: dict[str, list[float | None]]
 
 
+class AuditLine(_Answer):
+    """One change or refusal: ``who`` is the name of a key, ``client`` an address."""
+
+    id: int
+    time: Instant
+    who: str
+    method: str
+    path: str
+    status: int
+    client: str
+    detail: str
+
+
+class AuditList(_Answer):
+    """Lines of the audit log, the newest first."""
+
+    audit: list[AuditLine]
+
+
+WebhookEvent = Literal["anomaly", "limit", "stale", "model", "job_failed"]
+DeliveryState = Literal["waiting", "delivered", "dead"]
+
+
+class WebhookRequest(_Request):
+    """Where to send which events of which twins; null: all. Without a secret one is made."""
+
+    url: Annotated[str, Field(max_length=2000)]
+    twins: list[str] | None = None
+    types: list[WebhookEvent] | None = None
+    secret: Annotated[str, Field(min_length=16, max_length=200)] | None = None
+
+
+class Webhook(_Answer):
+    """A webhook without its secret."""
+
+    id: int
+    url: str
+    twins: list[str] | None
+    types: list[WebhookEvent] | None
+    created: Instant
+
+
+class WebhookMade(Webhook):
+    """A webhook with the secret that signs what it is sent."""
+
+    secret: str
+
+
+class WebhookList(_Answer):
+    """Every webhook."""
+
+    webhooks: list[Webhook]
+
+
+class WebhookDelivery(_Answer):
+    """One message to a webhook; ``reason`` says what went wrong last, ``next`` when it is tried again."""
+
+    id: int
+    webhook: int
+    created: Instant
+    event: WebhookEvent
+    state: DeliveryState
+    attempts: int
+    next: Instant | None
+    reason: str
+    body: dict[str, Any]
+
+
+class DeliveryList(_Answer):
+    """Deliveries, the newest first."""
+
+    deliveries: list[WebhookDelivery]
+
+
+class RetentionRequest(_Request):
+    """How long what belongs to a twin is kept; null: for ever.
+
+    Days count back from the twin's newest sample; ``models`` and ``jobs`` are numbers of the newest ones that stay, beside the
+    active model and its parent, and of jobs of each kind.
+    """
+
+    samples_days: Positive | None = None
+    residuals_days: Positive | None = None
+    models: Annotated[int, Field(ge=0)] | None = None
+    jobs: Annotated[int, Field(ge=0)] | None = None
+
+
+class Retention(_Answer):
+    """How long what belongs to a twin is kept."""
+
+    samples_days: float | None
+    residuals_days: float | None
+    models: int | None
+    jobs: int | None
+
+
 class Columns(BaseModel):
     """Samples as columns: one value or null per time and channel, in the channel's own unit."""
 
@@ -188,20 +317,28 @@ class Archive(_Answer):
     downsampled: bool
 
 
-class CalibrationRequest(_Request):
-    """What a calibration uses: the whole archive unless a part is named."""
+class _Selecting(_Request):
+    """Which part of the archive a job looks at: the newest ``samples`` of start <= time < stop.
 
-    method: str = "second-order"
+    With ``thin`` it looks at as many samples evenly over that time instead, of which inputs that hold have their mean.
+    """
+
     start: Time | None = None
     stop: Time | None = None
+    samples: Annotated[int, Field(ge=20)] | None = Field(default=None, description="absent: as TWIN_JOB_VALUES says")
+    thin: bool = False
+
+
+class CalibrationRequest(_Selecting):
+    """What a calibration uses."""
+
+    method: str = "second-order"
     activate: bool | None = Field(default=None, description="true: always, false: never, absent: if it is the better")
 
 
-class DiagnosisRequest(_Request):
+class DiagnosisRequest(_Selecting):
     """What a diagnosis uses and how much of it is held back for the score."""
 
-    start: Time | None = None
-    stop: Time | None = None
     holdout: Share = 0.3
     burn_in_s: Positive | None = None
     false_alarm_rate: Annotated[float, BeforeValidator(_finite), Field(gt=0, lt=0.5)] = 0.01
@@ -429,6 +566,6 @@ class ShelveRequest(_Request):
 class Message(_Answer):
     """One message of a stream."""
 
-    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "alarm", "dropped"]
+    type: Literal["sample", "residual", "anomaly", "job", "model", "telemetry", "alarm", "twin", "stale", "dropped"]
     seq: int
     time: Instant

@@ -1,9 +1,11 @@
 """The running server: the application behind uvicorn, shut down without losing what was acknowledged."""
 
+import asyncio
 import contextlib
 import gc
 import logging
 import os
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -11,7 +13,7 @@ from collections.abc import Callable
 import uvicorn
 
 from service.app import create_app
-from service.patience import patient
+from service.http.protocol import patient
 from service.settings import Settings, unknown_variables
 from service.store.database import Database
 from service.workbench import MakeWorkbench
@@ -70,9 +72,8 @@ def serve(
         timeout_graceful_shutdown=SHUTDOWN_S,
         server_header=False,
     )
-    server = _Server(
-        config, on_ready, lambda: app.state.service.hub.close(), f"http://{f'[{host}]' if ':' in host else host}:{port}"
-    )
+    url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
+    server = _Server(config, on_ready, lambda: app.state.service.hub.close(), app.state.keys.reload, url)
     sys.setswitchinterval(SWITCH_S)
     # Workers inherit it: their matrices are small and gain nothing from more threads, while the service would wait.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -100,10 +101,12 @@ class _Server(uvicorn.Server):
         config: uvicorn.Config,
         on_ready: Callable[[str], None] | None,
         end_streams: Callable[[], None],
+        on_hangup: Callable[[], None],
         url: str,
     ) -> None:
         super().__init__(config)
         self._on_ready, self._end_streams, self._url = on_ready, end_streams, url
+        self._on_hangup = on_hangup
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End the streams first: they would hold the shutdown up until its deadline."""
@@ -111,6 +114,7 @@ class _Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        asyncio.get_running_loop().add_signal_handler(signal.SIGHUP, self._on_hangup)
         await super().startup(sockets)
         gc.collect()
         gc.freeze()  # what is there now stays: looking through it again and again costs milliseconds each time

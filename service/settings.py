@@ -8,7 +8,8 @@ from typing import Any
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.access import Role, is_loopback, parse_keys
+from service.http.auth import is_loopback
+from service.http.keys import Key, Keys, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
@@ -27,6 +28,9 @@ class Settings(BaseSettings):
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 picks a free one.")
     database_url: str = Field("sqlite:///thermal-twin.sqlite3", description="Where everything is stored.")
     api_keys: SecretStr = Field(SecretStr(""), description="role:key pairs separated by commas.")
+    api_keys_file: Path | None = Field(
+        None, description="File with a line 'name role key [expires]' per key; read again whenever it changes."
+    )
     max_body_bytes: int = Field(16 * MIB, ge=1024, description="Largest request body, after decompression.")
     body_timeout_s: float = Field(
         30.0, gt=0, description="Longest wait for a request head, or a body (plus 1 s per 32 KiB)."
@@ -36,7 +40,16 @@ class Settings(BaseSettings):
     )
     job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
+    job_values: int = Field(
+        250_000,
+        ge=1000,
+        description="Most values, samples times channels, that a job takes unless its request says more.",
+    )
+    job_memory_mib: int = Field(2048, ge=256, description="A job that needs more memory is ended and marked failed.")
     assimilate: bool = Field(True, description="Whether new samples update the state of the active model.")
+    assimilate_samples: int = Field(
+        200_000, ge=1000, description="A model that becomes active follows at most so many samples of the past."
+    )
     calibrate_every_s: float | None = Field(None, gt=0, description="Recalibrate on this schedule; unset: on request.")
     anomaly_patience_s: float = Field(3600.0, ge=0, description="Recalibrate if an anomaly lasts so long; 0: never.")
     false_alarm_rate: float = Field(
@@ -59,6 +72,8 @@ class Settings(BaseSettings):
     def _is_sqlite(cls, value: str) -> str:
         if not value.startswith("sqlite:///") or len(value) <= len("sqlite:///"):
             raise ValueError("must be sqlite:///FILE (sqlite:////FILE for an absolute path)")
+        if value.removeprefix("sqlite:///").startswith((":memory:", "file:")):
+            raise ValueError("must name a file: what is in memory only does not survive, and readers would not see it")
         return value
 
     @field_validator("api_keys")
@@ -69,14 +84,23 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _open_only_on_loopback(self) -> "Settings":
-        if not self.roles and not is_loopback(self.host):
+        if self.api_keys_file is None and not self.fixed_keys and not is_loopback(self.host):
             raise ValueError(f"host {self.host} is not loopback and TWIN_API_KEYS is empty; set keys or use 127.0.0.1")
         return self
 
     @property
-    def roles(self) -> dict[str, Role]:
-        """API key -> role."""
+    def fixed_keys(self) -> tuple[Key, ...]:
+        """The API keys of the environment."""
         return parse_keys(self.api_keys.get_secret_value())
+
+    @property
+    def keys(self) -> Keys:
+        """All API keys; SettingsError if their file cannot be used."""
+        try:
+            return Keys(self.fixed_keys, self.api_keys_file)
+        except (ValueError, OSError) as error:
+            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            raise SettingsError(f"TWIN_API_KEYS_FILE: {self.api_keys_file}: {reason}") from None
 
     @property
     def effect_files(self) -> tuple[Path, ...]:

@@ -14,8 +14,10 @@ from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
 from replay.cli.forecast import forecast
+from replay.cli.keep import backup, migrate, restore
 from replay.cli.play import replay
 from replay.cli.record import record
+from replay.cli.register import register
 from replay.cli.serve import serve
 from replay.cli.simulate import simulate
 from replay.errors import ReplayError
@@ -38,7 +40,10 @@ def twin(traceback: bool) -> None:
     """
 
 
-for command in (demo, serve, simulate, replay, record, calibrate, forecast, close_loop, check_effect):
+for command in (
+    *(demo, serve, register, simulate, replay, record, calibrate, forecast, close_loop, check_effect),
+    *(backup, restore, migrate),
+):
     twin.add_command(command)
 
 

@@ -6,15 +6,18 @@ it. Here a task that crashes, hangs or is cancelled harms nobody else.
 
 import contextlib
 import importlib
+import math
 import multiprocessing
 import multiprocessing.connection
 import os
+import re
 import signal
 import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any, ParamSpec, TypeVar
 
@@ -62,8 +65,9 @@ class Cancel:
 class ProcessPerTask(Executor):
     """Runs ``function(*args, progress=...)`` in a fresh spawned process per task, at most ``max_workers`` at a time."""
 
-    def __init__(self, max_workers: int, deadline_s: float) -> None:
-        """Tasks that run longer than ``deadline_s`` are ended."""
+    def __init__(self, max_workers: int, deadline_s: float, memory_MiB: float = math.inf) -> None:
+        """Tasks that run longer than ``deadline_s`` or need more than ``memory_MiB`` are ended."""
+        self._memory_MiB = memory_MiB
         self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix="job")
         self._deadline_s = deadline_s
         self._closing = Cancel()
@@ -101,6 +105,11 @@ class ProcessPerTask(Executor):
                     raise JobCancelled
                 if time.monotonic() > deadline_s:
                     raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+                if resident_MiB(process.pid or 0) > self._memory_MiB:
+                    raise JobFailed(
+                        f"ended: it needed more than {self._memory_MiB:g} MiB of memory (TWIN_JOB_MEMORY_MIB); "
+                        "take fewer samples, or thin them"
+                    )
                 if not ours.poll(POLL_S):
                     continue
                 kind, *rest = _receive(ours, process)
@@ -113,6 +122,16 @@ class ProcessPerTask(Executor):
         finally:
             _end(process)
             ours.close()
+
+
+def resident_MiB(process: int) -> float:
+    """Return the memory that a process has in use; 0 where nobody can tell."""
+    try:
+        status = Path(f"/proc/{process}/status").read_text()
+    except OSError:
+        return 0.0
+    found = re.search(r"VmRSS:\s+(\d+) kB", status)
+    return int(found[1]) / 1024 if found else 0.0
 
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -143,6 +162,7 @@ def _end(process: Any) -> None:
 def prepare_worker() -> None:
     """Make a worker process live exactly as long as the service wants it to."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the parent decides
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as does the parent
     Thread(target=_end_with_parent, daemon=True).start()
 
 

@@ -1,6 +1,5 @@
 """What becomes of a finished job: a new model version, perhaps active, and the messages that say so."""
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 from service.instants import now_us, parse_instant
 from service.messages import EventStretch, Stretch
 from service.store import anomalies, events, jobs, models
+from service.store.connection import Connection
 from service.workbench import Outcome
 from twin_core.anomaly.detect import TOGETHER
 
@@ -24,6 +24,8 @@ class Finished:
     provenance: Json
     rival: int | None
     activate: bool | None
+    part: str = ""
+    """Which part of the archive it looked at, in words; empty: all."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,7 @@ class Decision:
     reason: str
 
 
-def save(connection: sqlite3.Connection, twin: int, finished: Finished) -> tuple[int | None, Sequence[Stretch]]:
+def save(connection: Connection, twin: int, finished: Finished) -> tuple[int | None, Sequence[Stretch]]:
     """Store version, activation and result in one transaction; return the version that is active now if it changed."""
     if finished.kind == "diagnosis" and not (finished.outcome.report or {}).get("findings"):
         return None, _end(connection, twin, finished, None, Decision(False, "nothing was found to add"))
@@ -58,7 +60,7 @@ def _summary(finished: Finished) -> Json:
     }
 
 
-def _explain(connection: sqlite3.Connection, twin: int, finished: Finished) -> None:
+def _explain(connection: Connection, twin: int, finished: Finished) -> None:
     """Give the anomalies that the findings explain their cause: at their places, and where the first one let the error fall."""
     report = finished.outcome.report
     if report is None:
@@ -102,7 +104,7 @@ def _sensors_at(specification: Json, where: Json) -> list[str]:
     return sorted(found)
 
 
-def _decide(connection: sqlite3.Connection, twin: int, finished: Finished) -> Decision:
+def _decide(connection: Connection, twin: int, finished: Finished) -> Decision:
     """Return whether the new model becomes the active one, and why."""
     if finished.activate is not None:
         return Decision(finished.activate, "requested" if finished.activate else "not asked for")
@@ -120,15 +122,16 @@ def _decide(connection: sqlite3.Connection, twin: int, finished: Finished) -> De
 
 def _message(finished: Finished, version: int | None, decision: Decision) -> str:
     """Return the outcome in one line, what could not be scored included."""
+    part = f"; from {finished.part}" if finished.part else ""
     if version is None:
-        return decision.reason
+        return decision.reason + part
     unscored = finished.outcome.validation.get("rmse_K") is None
     score = "; its error is not known: the data held back hold no reading to compare with" if unscored else ""
-    return f"version {version} is {'active' if decision.activate else 'not active'}: {decision.reason}{score}"
+    return f"version {version} is {'active' if decision.activate else 'not active'}: {decision.reason}{score}{part}"
 
 
 def _end(
-    connection: sqlite3.Connection, twin: int, finished: Finished, version: int | None, decision: Decision
+    connection: Connection, twin: int, finished: Finished, version: int | None, decision: Decision
 ) -> Sequence[Stretch]:
     outcome = finished.outcome
     result: Json = {"model_version": version, "version": version, "activated": decision.activate}
@@ -146,7 +149,7 @@ def _end(
     return [EventStretch(tuple(events.append(connection, twin, now_us(), messages)))]
 
 
-def _brief(connection: sqlite3.Connection, twin: int, kind: str, job: str) -> Json:
+def _brief(connection: Connection, twin: int, kind: str, job: str) -> Json:
     """Return a job for the stream; its result may be large and is fetched by those who want it."""
     wire = jobs.get(connection, twin, kind, job).wire()
     if kind == "diagnosis" and wire["result"] is not None:
@@ -154,8 +157,13 @@ def _brief(connection: sqlite3.Connection, twin: int, kind: str, job: str) -> Js
     return wire
 
 
+def tell(connection: Connection, twin: int, messages: list[tuple[str, Json]]) -> tuple[None, Sequence[Stretch]]:
+    """Tell the stream something."""
+    return None, [EventStretch(tuple(events.append(connection, twin, now_us(), messages)))]
+
+
 def announce(
-    connection: sqlite3.Connection, twin: int, kind: str, job: str, change: Any, *args: Any
+    connection: Connection, twin: int, kind: str, job: str, change: Any, *args: Any
 ) -> tuple[Json, Sequence[Stretch]]:
     """Apply ``change(connection, ...)`` to a job and tell the stream how it stands now."""
     change(connection, *args)
@@ -163,9 +171,7 @@ def announce(
     return wire, [EventStretch(tuple(events.append(connection, twin, now_us(), [("job", {"job": wire})])))]
 
 
-def activate(
-    connection: sqlite3.Connection, twin: int, version: int, reason: str
-) -> tuple[models.ModelRow, Sequence[Stretch]]:
+def activate(connection: Connection, twin: int, version: int, reason: str) -> tuple[models.ModelRow, Sequence[Stretch]]:
     """Make a version the active one and tell the stream."""
     models.activate(connection, twin, version, reason)
     row = models.get(connection, twin, version)
@@ -174,7 +180,7 @@ def activate(
 
 
 def add_manual(
-    connection: sqlite3.Connection, twin: int, outcome: Outcome, provenance: Json
+    connection: Connection, twin: int, outcome: Outcome, provenance: Json
 ) -> tuple[models.ModelRow, Sequence[Stretch]]:
     """Store a model that was made elsewhere as a new, inactive version."""
     summary = _summary(Finished("", "manual", outcome, provenance, None, False))

@@ -10,17 +10,20 @@ from typing import Any
 
 import numpy as np
 
+from service.errors import Refusal
+from service.http.problems import Problem
 from service.instants import parse_instant
 from service.jobs import outcome
 from service.jobs.executor import Cancel, JobCancelled, JobFailed, ProcessPerTask
 from service.jobs.outcome import Finished
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry
-from service.store import jobs, models, samples
+from service.store import jobs, models, selection
 from service.store.database import Database
 from service.store.jobs import JobRow
 from service.store.models import Active
+from service.store.samples import Samples
+from service.store.selection import Selection
 from service.streams import Hub
 from service.workbench import CalibrationTask, DiagnosisTask, MakeWorkbench, Telemetry, work
 from twin_core import __version__
@@ -57,14 +60,18 @@ class Jobs:
         hub: Hub,
         metrics: Metrics,
         workbench: MakeWorkbench,
+        executor: ProcessPerTask,
         workers: int,
-        deadline_s: float,
+        job_values: int,
         on_model: Callable[[int], None],
     ) -> None:
-        """Run at most ``workers`` jobs at a time; ``on_model`` hears of every twin whose active model changed."""
+        """Run at most ``workers`` jobs at a time in an executor; a job takes ``job_values`` values unless asked for more.
+
+        ``on_model`` hears of every twin whose active model changed.
+        """
         self._database, self._hub, self._metrics = database, hub, metrics
         self._workbench, self._on_model = workbench, on_model
-        self._executor = ProcessPerTask(workers, deadline_s)
+        self._executor, self._job_values = executor, job_values
         self._free = asyncio.Semaphore(workers)
         self._running: dict[str, _Running] = {}
 
@@ -122,8 +129,8 @@ class Jobs:
                 self._free.release()
         except JobCancelled:
             state, message = "cancelled", "cancelled"
-        except (JobFailed, Problem) as error:
-            message = error.detail if isinstance(error, Problem) else str(error)
+        except (JobFailed, Refusal) as error:
+            message = error.detail if isinstance(error, Refusal) else str(error)
             if isinstance(error, JobFailed) and error.trace is not None:
                 log.error("a job met a defect", extra={"job": row.id, "kind": row.kind, "trace": error.trace})
         except Exception as error:
@@ -151,13 +158,17 @@ class Jobs:
         change = (jobs.finish, row.id, state, message)
         try:
             await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
-        except (LookupError, Problem):
+        except (LookupError, Refusal):
             log.info("a job ended after its twin was deleted", extra={"job": row.id})
 
     async def _work(self, twin: Entry, row: JobRow, request: Json, cancel: Cancel) -> None:
         """Do a job whose turn it is."""
         await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, jobs.begin, row.id)
-        telemetry = await self.telemetry(twin, request.get("start"), request.get("stop"))
+        chosen = await self.choose(twin, request)
+        if chosen.words:
+            change = (jobs.report, row.id, 0.0, f"takes {chosen.words}")
+            await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
+        telemetry = _telemetry(twin, chosen.samples)
         active = await self._database.read(models.active, twin.key)
         task, function = self._task(twin, row.kind, request, telemetry, active)
         progress = self._reporter(twin, row)
@@ -166,13 +177,13 @@ class Jobs:
         provenance = {
             "data_sha256": telemetry.sha256(),
             "settings": request,
+            "telemetry": chosen.wire(),
             "code_version": __version__,
             "epoch_us": telemetry.epoch_us,
             "parent": None if active is None else active.version,
         }
-        finished = Finished(
-            row.id, row.kind, made, provenance, None if active is None else active.version, _wish(row, request)
-        )
+        rival = None if active is None else active.version
+        finished = Finished(row.id, row.kind, made, provenance, rival, _wish(row, request), chosen.words)
         if await self._hub.write(twin.key, outcome.save, twin.key, finished) is not None:
             self._on_model(twin.key)
 
@@ -186,17 +197,25 @@ class Jobs:
         cut = validation_start(telemetry, None if active is None else active.train_stop_us)
         return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival), "calibrate"
 
-    async def telemetry(self, twin: Entry, start: Any, stop: Any) -> Telemetry:
-        """Return a part of the archive for a worker; Problem 422 if it holds too little."""
-        start_us = None if start is None else parse_instant(start, "start")
-        stop_us = None if stop is None else parse_instant(stop, "stop")
-        n = len(twin.channels)
-        found = await self._database.read(samples.select, twin.key, n, range(n), start_us, stop_us)
-        if found.time_us.size < LEAST_SAMPLES:
-            raise Problem(422, f"the archive holds {found.time_us.size} samples there, {LEAST_SAMPLES} are needed")
-        values = {name: np.ascontiguousarray(found.values[i]) for i, name in enumerate(twin.channels)}
-        present = {name: column for name, column in values.items() if np.isfinite(column).any()}
-        return Telemetry(int(found.time_us[0]), found.time_us, present)
+    async def choose(self, twin: Entry, request: Json) -> Selection:
+        """Return the part of the archive that a request names; Problem 422 if it holds too little."""
+        start_us, stop_us = (
+            None if (at := request.get(n)) is None else parse_instant(at, n) for n in ("start", "stop")
+        )
+        n, spec = len(twin.channels), twin.spec
+        most = request.get("samples") or max(self._job_values // n, LEAST_SAMPLES)
+        sensors = [twin.channels.index(name) for name in twin.sensors]
+        averaged = [
+            row
+            for row, name in enumerate(twin.channels)
+            if spec.channels[name].kind == "power" and spec.channels[name].is_held
+        ]
+        how = (start_us, stop_us, most, bool(request.get("thin")), sensors, averaged)
+        chosen = await self._database.read(selection.choose, twin.key, n, *how)
+        if chosen.samples.time_us.size < LEAST_SAMPLES:
+            held = chosen.samples.time_us.size
+            raise Problem(422, f"the archive holds {held} samples there, {LEAST_SAMPLES} are needed")
+        return chosen
 
     def _reporter(self, twin: Entry, row: JobRow) -> Callable[[float, str], None]:
         """Return a progress callback for worker threads that writes now and then."""
@@ -211,6 +230,13 @@ class Jobs:
                 self._hub.submit(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
 
         return report
+
+
+def _telemetry(twin: Entry, found: Samples) -> Telemetry:
+    """Return samples for a worker, without channels of which they hold nothing."""
+    values = {name: np.ascontiguousarray(found.values[i]) for i, name in enumerate(twin.channels)}
+    present = {name: column for name, column in values.items() if np.isfinite(column).any()}
+    return Telemetry(int(found.time_us[0]), found.time_us, present)
 
 
 def _wish(row: JobRow, request: Json) -> bool | None:

@@ -6,8 +6,8 @@ import logging
 import time
 from dataclasses import dataclass, field
 
+from service.errors import Refusal
 from service.jobs.runner import LEAST_SAMPLES, Jobs
-from service.problems import Problem
 from service.registry import Entry, Registry
 from service.schemas import CalibrationRequest
 from service.store import anomalies, twins
@@ -70,7 +70,7 @@ class Schedule:
             for twin in self._registry:
                 try:
                     await self._look(twin, time.monotonic())
-                except Problem as error:
+                except Refusal as error:
                     log.info("no recalibration", extra={"twin": twin.name, "reason": error.detail})
 
     async def _look(self, twin: Entry, now_s: float) -> None:

@@ -8,8 +8,8 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
+from service.http.problems import Problem
 from service.jobs.executor import prepare_worker
-from service.problems import Problem
 from service.workbench import Filtered, Forecasted, ForecastTask, Json, MakeWorkbench, Masks, Outcome, Telemetry
 
 P = ParamSpec("P")

@@ -37,7 +37,7 @@ class Following:
         self._engine, self._thresholds = engine, thresholds
 
     async def filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
-        """Filter a block from a position; TwinError or Problem if it cannot be done."""
+        """Filter a block from a position; TwinError or Refusal if it cannot be done."""
         clean, seen = await self._readings(fresh, before)
         telemetry, held = stretch(self._twin, clean, active.epoch_us, before)
         state = None if before is None else before.state
@@ -46,6 +46,17 @@ class Following:
     async def memory_s(self, active: Active, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model where some telemetry begins."""
         return await self._engine.memory_s(active.document, telemetry)
+
+    async def opened(self, fresh: Samples) -> Samples:
+        """Return samples of which the first has the inputs that hold there, whenever they came."""
+        inputs = [row for row, name in enumerate(self._twin.channels) if name not in self._twin.sensors]
+        missing = [row for row in inputs if np.isnan(fresh.values[row, 0])]
+        if missing:
+            n, first_us = len(self._twin.channels), int(fresh.time_us[0])
+            held = await self._database.read(samples.last_values, self._twin.key, n, missing, first_us)
+            for row, value in held.items():
+                fresh.values[row, 0] = value
+        return fresh
 
     async def _readings(self, fresh: Samples, before: Position | None) -> tuple[Samples, Samples]:
         """Return a block without what the samples before it show to be no readings, and without missing ones alone."""
@@ -56,6 +67,19 @@ class Following:
             span_us = (start_us, int(fresh.time_us[0]))
             context = await self._database.read(samples.select, self._twin.key, n, range(n), *span_us)
         return await screening.readings(self._twin, self._engine, context, fresh)
+
+    def _in_order(
+        self, sensors: tuple[str, ...], *matrices: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return (n_times, n_sensors) matrices with a column per sensor of the twin, NaN where the model knows it not."""
+        if sensors == self._twin.sensors:
+            return matrices[0], matrices[1]
+        ordered = [np.full((m.shape[0], len(self._twin.sensors)), np.nan) for m in matrices]
+        for column, name in enumerate(self._twin.sensors):
+            if name in sensors:
+                for made, matrix in zip(ordered, matrices, strict=True):
+                    made[:, column] = matrix[:, sensors.index(name)]
+        return ordered[0], ordered[1]
 
     def step(
         self,
@@ -102,6 +126,6 @@ class Following:
         recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
         after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, detector, recent_us)
         checkpoint = None if is_provisional else after.checkpoint()
-        found = (time_us, innovation, std, nis, told, changes)
+        found = (time_us, *self._in_order(filtered.sensors, innovation, std), nis, told, changes)
         step = Step(active.version, revision, after_us, after_gap, *found, checkpoint)
         return after, step

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from service.errors import BadField, short
+from service.http.problems import Problem
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
 from service.live.position import Position
 from service.live.pulse import Beat
 from service.live.tracker import Tracker
-from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
@@ -90,7 +91,9 @@ def _plan(twin: Entry, plan: Columns, epoch_us: int) -> Telemetry | None:
     """Return the planned inputs; None if no time is planned."""
     for name, column in plan.values.items():
         if name not in twin.channels:
-            raise BadField(f"plan.values.{name}", f"unknown channel '{name}' (known: {', '.join(twin.channels)})")
+            raise BadField(
+                f"plan.values.{name}", f"unknown channel '{short(name)}' (known: {', '.join(twin.channels)})"
+            )
         if name in twin.sensors:
             raise BadField(f"plan.values.{name}", "is what the forecast predicts; plan inputs and boundaries only")
         if len(column) != len(plan.time):
@@ -176,7 +179,10 @@ async def behind(tracker: Tracker, database: Database) -> Behind:
     lag_us = 0
     if position is not None and last_us is not None and last_us != tracker.waits_us:
         lag_us = max(last_us - position.time_us, 0)
-    return Behind(lag_us / 1e6, max(head.samples - tracker.left, 0), head.samples, head.quarantined)
+    of = head.samples
+    if tracker.floor_us is not None:
+        of = await database.read(samples.count_after, tracker.twin.key, tracker.floor_us - 1)
+    return Behind(lag_us / 1e6, max(of - tracker.left, 0), of, head.quarantined)
 
 
 def notices(tracker: Tracker, position: Position, lag: Behind, silent_s: float | None) -> list[str]:

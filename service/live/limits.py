@@ -2,24 +2,24 @@
 
 import asyncio
 import logging
-import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
+from service.errors import Refusal
 from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
 from service.live.tracker import Tracker
 from service.messages import EventStretch, Stretch
-from service.problems import Problem
 from service.registry import Entry
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
 from service.store.alarms import AlarmRow, Limit
+from service.store.connection import Connection
 from service.store.database import Database
-from service.store.gone import TwinGone
+from service.store.errors import TwinGone
 from service.store.samples import Samples
 from service.streams import Hub
 from service.workbench import Forecasted
@@ -120,13 +120,13 @@ class LimitWatch:
         request = ForecastRequest(horizon_s=self._horizon_s, step_s=self._horizon_s / STEPS, quantiles=list(QUANTILES))
         try:
             found = await forecasts.look_ahead(tracker, self._database, self._engine, request)
-        except (Problem, TwinError):
+        except (Refusal, TwinError):
             self._foreseen_s.pop(twin.key, None)
             return  # there is no state yet
         await self._hub.write(twin.key, foresee, twin, limits, found.position.time_us, found.made)
 
 
-def look(connection: sqlite3.Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
+def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
     """Watch what arrived since the last look; what is older than that raises nothing."""
     seq, state = alarms.watched(connection, twin.key)
     latest, n = samples.latest_seq(connection, twin.key), len(twin.channels)
@@ -158,7 +158,7 @@ def look(connection: sqlite3.Connection, twin: Entry) -> tuple[None, Sequence[St
 
 
 def foresee(
-    connection: sqlite3.Connection, twin: Entry, limits: Sequence[Limit], from_us: int, made: Forecasted
+    connection: Connection, twin: Entry, limits: Sequence[Limit], from_us: int, made: Forecasted
 ) -> tuple[None, Sequence[Stretch]]:
     """Raise an alarm where a limit is reached in half of the futures; end it where it is in less than a quarter."""
     lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
@@ -226,7 +226,7 @@ def _says(limit: Limit, unit: str | None, worst: float) -> str:
     )
 
 
-def _told(connection: sqlite3.Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:
+def _told(connection: Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:
     """Return the messages that tell of alarms; nobody hears of those that are shelved."""
     messages = [("alarm", {"alarm": row.wire()}) for row in news if not row.is_shelved(now_us())]
     if not messages:

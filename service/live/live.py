@@ -2,6 +2,7 @@
 
 import copy
 
+from service.http.problems import Problem
 from service.live import pulse as pulses
 from service.live.engine import Engine
 from service.live.limits import LimitWatch
@@ -9,7 +10,6 @@ from service.live.pulse import Beat, Pulse
 from service.live.scores import Scores
 from service.live.tracker import Tracker
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry
 from service.store.database import Database
 from service.streams import Hub
@@ -28,8 +28,10 @@ class Live:
         workbench: MakeWorkbench,
         false_alarm_rate: float,
         limit_horizon_s: float,
+        window: int,
     ) -> None:
-        """Start without twins."""
+        """Start without twins; a new model follows at most the newest ``window`` samples of the past."""
+        self._window = window
         self.engine = Engine(workbench)
         self._database, self._hub, self._metrics = database, hub, metrics
         self._thresholds = Thresholds(false_alarm_rate)
@@ -42,7 +44,7 @@ class Live:
         """Begin to track a twin."""
         if twin.key not in self._trackers:
             rooms = (self._database, self._hub, self.engine, self._metrics)
-            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds)
+            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds, self._window)
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""

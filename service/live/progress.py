@@ -1,6 +1,5 @@
 """One step of assimilation written down: residuals, checkpoint, anomalies and messages in one transaction."""
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from service.registry import Entry
 from service.store import anomalies, checkpoints, events, residuals, samples
 from service.store.anomalies import AnomalyRow, Change
 from service.store.checkpoints import Checkpoint
+from service.store.connection import Connection
 from service.store.residuals import Residuals
 from service.store.samples import Samples
 
@@ -85,7 +85,7 @@ class Reading:
     revision: int
 
 
-def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:
+def save(connection: Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:
     """Store a step; residuals of samples that arrived live get stream numbers, the others zero.
 
     What was said provisionally of the same time is replaced. Outdated if samples were taken away meanwhile.
@@ -114,7 +114,7 @@ def save(connection: sqlite3.Connection, twin: Entry, step: Step) -> tuple[None,
     return None, stretches
 
 
-def _news(connection: sqlite3.Connection, twin: Entry, rows: Sequence[AnomalyRow]) -> list[Stretch]:
+def _news(connection: Connection, twin: Entry, rows: Sequence[AnomalyRow]) -> list[Stretch]:
     """Return the messages that tell of anomalies."""
     if not rows:
         return []
@@ -123,15 +123,13 @@ def _news(connection: sqlite3.Connection, twin: Entry, rows: Sequence[AnomalyRow
 
 
 def end_record(
-    connection: sqlite3.Connection, twin: Entry, version: int, last_us: int, until_us: int
+    connection: Connection, twin: Entry, version: int, last_us: int, until_us: int
 ) -> tuple[None, Sequence[Stretch]]:
     """Write down that ``last_us`` is the last sample before a long gap, behind which ``until_us`` is known already."""
     return None, _news(connection, twin, anomalies.close(connection, twin.key, version, last_us, until_us))
 
 
-def rewind(
-    connection: sqlite3.Connection, twin: Entry, version: int, late_us: int, until_us: int | None
-) -> Checkpoint | None:
+def rewind(connection: Connection, twin: Entry, version: int, late_us: int, until_us: int | None) -> Checkpoint | None:
     """Go back to the last checkpoint before a late sample and forget those from there to ``until_us``.
 
     Residuals and anomalies stay until they are replaced one by one: the sample that came late may concern few of them.
@@ -142,13 +140,26 @@ def rewind(
     return _dated(connection, twin, checkpoint)
 
 
-def resume(connection: sqlite3.Connection, twin: Entry, version: int) -> tuple[Checkpoint | None, int]:
-    """Return where a version stands, and the number at which the stream does."""
+def resume(connection: Connection, twin: Entry, version: int) -> tuple[Checkpoint | None, int, int | None]:
+    """Return where a version stands, the number at which the stream does, and the floor of its assimilation."""
     checkpoint = _dated(connection, twin, checkpoints.before(connection, twin.key, version))
-    return checkpoint, samples.latest_seq(connection, twin.key)
+    return checkpoint, samples.latest_seq(connection, twin.key), checkpoints.floor(connection, twin.key, version)
 
 
-def _dated(connection: sqlite3.Connection, twin: Entry, checkpoint: Checkpoint | None) -> Checkpoint | None:
+def lift_floor(connection: Connection, twin: Entry, version: int, window: int, from_us: int) -> int | None:
+    """Return the floor of a version's assimilation from now on: where more than ``window`` samples lie behind ``from_us``,
+    only the newest of them are looked at."""
+    known = checkpoints.floor(connection, twin.key, version)
+    if samples.count_after(connection, twin.key, from_us) <= window:
+        return known
+    at_us = samples.nth_newest_us(connection, twin.key, window)
+    if at_us is None or (known is not None and known >= at_us):
+        return known
+    checkpoints.raise_floor(connection, twin.key, version, at_us)
+    return at_us
+
+
+def _dated(connection: Connection, twin: Entry, checkpoint: Checkpoint | None) -> Checkpoint | None:
     """Return a checkpoint that knows what of the archive it had read; those of earlier releases do not say."""
     if checkpoint is not None:
         checkpoint.body.setdefault("seq", samples.latest_seq(connection, twin.key))
@@ -157,30 +168,35 @@ def _dated(connection: sqlite3.Connection, twin: Entry, checkpoint: Checkpoint |
 
 
 def look(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: Entry,
     read: Sequence[tuple[int, int, int]],
     told_seq: int,
     most: int,
     longest_gap_us: float,
     until_us: int | None,
+    floor_us: int | None = None,
 ) -> Reading:
     """Return at most ``most`` samples between what was read and ``until_us``, and whether what was read has changed since.
 
+    What lies before ``floor_us`` is not looked at.
     ``read`` are the stretches that were read, in order: (after, until] and the number at which the stream stood then.
     ``told_seq`` is the number up to which samples count as told.
     """
     seq = samples.latest_seq(connection, twin.key)
-    late = [samples.arrived(connection, twin.key, number, after + 1, until + 1) for after, until, number in read]
+    least = -(2**62) if floor_us is None else floor_us
+    late = [
+        samples.arrived(connection, twin.key, number, max(after + 1, least), until + 1) for after, until, number in read
+    ]
     first = _first_in_company(connection, twin.key, np.unique(np.concatenate([*late, _NONE])), longest_gap_us)
-    after_us = read[-1][1] if read else None
+    after_us = read[-1][1] if read else None if floor_us is None else floor_us - 1
     known_us = None if first is None else _next_record(connection, twin.key, first, read[-1][1], longest_gap_us)
     fresh, told, revision = ahead(connection, twin, after_us, told_seq, most, until_us)
     return Reading(seq, first, known_us, fresh, told, samples.count_after(connection, twin.key, after_us), revision)
 
 
 def ahead(
-    connection: sqlite3.Connection, twin: Entry, after_us: int | None, told_seq: int, most: int, until_us: int | None
+    connection: Connection, twin: Entry, after_us: int | None, told_seq: int, most: int, until_us: int | None
 ) -> tuple[Samples, NDArray[np.bool_], int]:
     """Return the next samples after an instant, which of them nobody was told about yet, and the archive's revision."""
     stop_us = samples.block_stop(connection, twin.key, after_us, most)
@@ -196,9 +212,7 @@ def ahead(
     return fresh, told, samples.revision(connection, twin.key)
 
 
-def outdates_inputs(
-    connection: sqlite3.Connection, twin: Entry, read: Sequence[tuple[int, int, int]], until_us: int
-) -> bool:
+def outdates_inputs(connection: Connection, twin: Entry, read: Sequence[tuple[int, int, int]], until_us: int) -> bool:
     """Return whether what lies from ``until_us`` on was read with inputs that hold there wrongly, see ``look``.
 
     The state starts anew behind a long gap, but an input holds until its next sample: one that came late, too.
@@ -216,7 +230,7 @@ def outdates_inputs(
 
 
 def _first_in_company(
-    connection: sqlite3.Connection, twin: int, instants: NDArray[np.int64], longest_gap_us: float
+    connection: Connection, twin: int, instants: NDArray[np.int64], longest_gap_us: float
 ) -> int | None:
     """Return the first instant with another sample no further than a long gap away; None if each stands alone.
 
@@ -230,9 +244,7 @@ def _first_in_company(
     return None
 
 
-def _next_record(
-    connection: sqlite3.Connection, twin: int, first_us: int, last_us: int, longest_gap_us: float
-) -> int | None:
+def _next_record(connection: Connection, twin: int, first_us: int, last_us: int, longest_gap_us: float) -> int | None:
     """Return the first instant behind the first long gap between two instants; None if there is no such gap."""
     instants = np.unique(samples.arrived(connection, twin, -1, first_us, last_us + 1))
     gaps = np.flatnonzero(np.diff(instants) > longest_gap_us)

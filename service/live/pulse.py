@@ -1,13 +1,13 @@
 """Is telemetry live? When each channel was last heard of, by the clock of this machine, and whether that is long ago."""
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from service.frames import Batch
 from service.store import samples
+from service.store.batch import Batch
+from service.store.connection import Connection
 
 STALE = 10.0
 """In usual intervals of a channel: one that has been silent for longer is stale."""
@@ -102,7 +102,7 @@ class Pulse:
         return found
 
 
-def brought_up(connection: sqlite3.Connection, twin: int, n_channels: int, known: Pulse | None) -> Pulse:
+def brought_up(connection: Connection, twin: int, n_channels: int, known: Pulse | None) -> Pulse:
     """Return what is known of every channel now, given what was known before.
 
     The first time the archive is looked through backwards, until each channel was heard often enough or for ``MOST`` samples.

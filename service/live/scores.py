@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import orjson
 
+from service.errors import Refusal
 from service.instants import format_instant
 from service.live.engine import Engine
-from service.problems import Problem
 from service.registry import Entry
 from service.store import models, samples, twins
 from service.store.database import Database
@@ -93,7 +93,7 @@ class Scores:
                 rmse_K[version] = await self._error_K(twin, version, orjson.dumps(document).decode(), telemetry)
             ends = int(found.time_us[0]), int(found.time_us[-1])
             self._made[twin.key] = _Comparison(held, revision, *ends, int(found.time_us.size), rmse_K)
-        except (LookupError, Problem) as error:
+        except (LookupError, Refusal) as error:
             log.info("models could not be compared", extra={"twin": twin.name, "reason": str(error)})
         finally:
             del self._under_way[twin.key]

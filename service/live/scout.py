@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from service.errors import Refusal
 from service.live.caution import Caution
 from service.live.following import Following
 from service.live.position import Position, is_far, next_count
 from service.live.progress import ahead, save
-from service.problems import Problem
 from service.registry import Entry
 from service.store import samples
 from service.store.database import Database
@@ -75,24 +75,13 @@ class Scout:
 
     async def _needed_s(self, found: Samples) -> float:
         """Return how long the network remembers where it started; infinite where that cannot be told."""
-        opening = await self._with_inputs(Samples(found.time_us, found.values.copy()))
+        opening = await self._following.opened(Samples(found.time_us, found.values.copy()))
         values = dict(zip(self._twin.channels, opening.values, strict=True))
         telemetry = Telemetry(self._active.epoch_us, opening.time_us, values)
         try:
             return MEMORIES * await self._following.memory_s(self._active, telemetry)
-        except (TwinError, Problem, ValueError, np.linalg.LinAlgError):
+        except (TwinError, Refusal, ValueError, np.linalg.LinAlgError):
             return float("inf")
-
-    async def _with_inputs(self, fresh: Samples) -> Samples:
-        """Return samples of which the first has the inputs that hold there, whenever they came."""
-        inputs = [row for row, name in enumerate(self._twin.channels) if name not in self._twin.sensors]
-        missing = [row for row in inputs if np.isnan(fresh.values[row, 0])]
-        if missing:
-            n, first_us = len(self._twin.channels), int(fresh.time_us[0])
-            held = await self._database.read(samples.last_values, self._twin.key, n, missing, first_us)
-            for row, value in held.items():
-                fresh.values[row, 0] = value
-        return fresh
 
     async def advance(self, told_seq: int) -> bool:
         """Follow the next block of what came; return whether there may be more.
@@ -112,7 +101,7 @@ class Scout:
         fresh = Samples(found.time_us[kept], found.values[:, kept].copy())
         before = self._before
         if before is None:
-            fresh = await self._with_inputs(fresh)
+            fresh = await self._following.opened(fresh)
         try:
             done = await self._following.filter(self._active, before, fresh)
         except Exception as error:  # whatever it is, it would come again with the same samples

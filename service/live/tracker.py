@@ -4,6 +4,7 @@ import asyncio
 import logging
 from dataclasses import dataclass, replace
 
+from service.errors import Refusal
 from service.instants import format_instant
 from service.live import progress
 from service.live.caution import Caution, Rest
@@ -13,11 +14,10 @@ from service.live.position import Position, is_far, next_count
 from service.live.progress import Outdated, Reading
 from service.live.scout import Base, Scout
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry
 from service.store import models
 from service.store.database import Database
-from service.store.gone import TwinGone
+from service.store.errors import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
@@ -55,9 +55,22 @@ class Tracker:
     """Keeps one twin's state up to date in the background."""
 
     def __init__(
-        self, twin: Entry, database: Database, hub: Hub, engine: Engine, metrics: Metrics, thresholds: Thresholds
+        self,
+        twin: Entry,
+        database: Database,
+        hub: Hub,
+        engine: Engine,
+        metrics: Metrics,
+        thresholds: Thresholds,
+        window: int,
     ) -> None:
-        """Start in the background; the state comes from the last checkpoint."""
+        """Start in the background; the state comes from the last checkpoint.
+
+        Where a model is to follow more than ``window`` samples of the past, it follows the newest of them only.
+        """
+        self._window = window
+        self.floor_us: int | None = None
+        """The assimilation looks at nothing before this instant; None: it began with the archive."""
         self.twin = twin
         self.active: Active | None = None
         self.waits_us: int | None = None
@@ -186,12 +199,21 @@ class Tracker:
             return
         if self.active is not None and self.active.version == active.version and not anew:
             return
-        checkpoint, self._told_seq = await self._database.read(progress.resume, self.twin, active.version)
+        checkpoint, self._told_seq, self.floor_us = await self._database.read(
+            progress.resume, self.twin, active.version
+        )
+        if checkpoint is None:
+            await self._lift_floor(active, _EVER)
         self._caution, self.trouble, self.catching_up = Caution(), None, True
         self._detour, self.waits_us, self._rest = None, None, Rest()
         self._scout, self._passed = None, None
         self._stand(None if checkpoint is None else Position.of(checkpoint))
         self.active = active
+
+    async def _lift_floor(self, active: Active, from_us: int) -> None:
+        """Leave out of what lies behind an instant all but the newest samples."""
+        arguments = (self.twin, active.version, self._window, from_us)
+        self.floor_us = await self._database.write(progress.lift_floor, *arguments)
 
     def _stand(self, position: Position | None) -> None:
         """Go on from a position, up to which the archive was read when the stream stood at its number."""
@@ -206,7 +228,14 @@ class Tracker:
             read = [*read, (read[-1][1] if read else _EVER, *caution.skipped)]
         until_us = None if detour is None else detour.until_us
         reading = await self._database.read(
-            progress.look, self.twin, read, self._told_seq, max(caution.most, 2), active.longest_gap_us, until_us
+            progress.look,
+            self.twin,
+            read,
+            self._told_seq,
+            max(caution.most, 2),
+            active.longest_gap_us,
+            until_us,
+            self.floor_us,
         )
         if reading.late_us is not None and not self._rest.lasts:
             self._caution = Caution()
@@ -236,10 +265,12 @@ class Tracker:
         self.catching_up |= reading.fresh.time_us.size >= progress.BLOCK
         kept = slice(0, min(count, caution.most))
         fresh = Samples(reading.fresh.time_us[kept], reading.fresh.values[:, kept])
+        if before is None and self.floor_us is not None:
+            fresh = await self._following.opened(Samples(fresh.time_us, fresh.values.copy()))
         try:
             done = await self._following.filter(active, before, fresh)
         except Exception as error:  # whatever it is, it would come again with the same samples
-            self.trouble = str(error) if isinstance(error, TwinError | Problem) else f"{type(error).__name__}: {error}"
+            self.trouble = str(error) if isinstance(error, TwinError | Refusal) else f"{type(error).__name__}: {error}"
             if caution.failed(fresh.time_us, reading.seq):
                 self._metrics.skipped.inc(int(fresh.time_us.size))
                 extra = {"twin": self.twin.name, "reason": self.trouble, "samples": int(fresh.time_us.size)}
@@ -263,6 +294,11 @@ class Tracker:
     async def _go_back(self, active: Active, before: Position, late_us: int, until_us: int | None) -> None:
         """Go back to before a late sample, and in a detour, if a long gap lies between it and here."""
         self._rest.leave()
+        await self._lift_floor(active, late_us)
+        if self.floor_us is not None:
+            late_us = max(late_us, self.floor_us)
+            if until_us is not None and late_us >= until_us:
+                return  # all of it lies before what is looked at
         if self._passed is None or self._passed.time_us < before.time_us:
             self._passed = before
         if self._detour is not None:

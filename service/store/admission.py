@@ -8,14 +8,14 @@ The present is the clock of this machine when a sample is received, plus a toler
   does not hold where the newest samples came when they were taken: nothing of a live twin is of the future.
 """
 
-import sqlite3
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.frames import Batch
 from service.store import aside, rewrite, samples
+from service.store.batch import Batch
+from service.store.connection import Connection
 from service.store.merge import QUARANTINED
 from service.store.samples import Receipt
 
@@ -25,7 +25,7 @@ RECENT = 12
 """So many of the last samples tell their usual distance, and whether they came live."""
 
 
-def admit(connection: sqlite3.Connection, twin: int, batch: Batch, tolerance_us: int) -> Receipt:
+def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) -> Receipt:
     """Store what is new in a batch, and put into quarantine what lies ahead of the present.
 
     Parameters
@@ -50,7 +50,7 @@ def admit(connection: sqlite3.Connection, twin: int, batch: Batch, tolerance_us:
     return receipt
 
 
-def _admit_some(connection: sqlite3.Connection, twin: int, batch: Batch, limit_us: int) -> Receipt:
+def _admit_some(connection: Connection, twin: int, batch: Batch, limit_us: int) -> Receipt:
     """Store a batch without the samples that neither are of the present nor go on from it."""
     ahead = batch.time_us > limit_us
     ahead[ahead] &= batch.time_us[ahead] > _reach_us(connection, twin, batch, limit_us)
@@ -66,7 +66,7 @@ def _admit_some(connection: sqlite3.Connection, twin: int, batch: Batch, limit_u
     return replace(receipt, status=status)
 
 
-def _reach_us(connection: sqlite3.Connection, twin: int, batch: Batch, limit_us: int) -> int:
+def _reach_us(connection: Connection, twin: int, batch: Batch, limit_us: int) -> int:
     """Return the last instant that follows from what is known, although it lies ahead of the present."""
     row = connection.execute("SELECT first_us, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
     first_us, last_us = (None, None) if row is None else row
@@ -86,9 +86,7 @@ def _reach_us(connection: sqlite3.Connection, twin: int, batch: Batch, limit_us:
     return int(path[gaps[0]] if gaps.size else path[-1])
 
 
-def _is_live(
-    connection: sqlite3.Connection, twin: int, recent_us: NDArray[np.int64], limit_us: int, batch: Batch
-) -> bool:
+def _is_live(connection: Connection, twin: int, recent_us: NDArray[np.int64], limit_us: int, batch: Batch) -> bool:
     """Return whether the last samples of the archive were received when they were taken, within the tolerance."""
     if not recent_us.size:
         return False
@@ -102,7 +100,7 @@ def _is_live(
     return delay_us.size > 0 and bool(np.median(np.abs(delay_us)) <= tolerance_us)
 
 
-def _recover(connection: sqlite3.Connection, twin: int, batch: Batch, limit_us: int, tolerance_us: int) -> int:
+def _recover(connection: Connection, twin: int, batch: Batch, limit_us: int, tolerance_us: int) -> int:
     """Move what the archive holds ahead of the present into quarantine, if it was no clock of its own; return how many."""
     past = batch.time_us <= limit_us
     live = bool((np.abs(batch.received - batch.time_us)[past] <= tolerance_us).any())

@@ -1,13 +1,13 @@
 """Alarms: stays of a channel beyond a limit, measured or forecast, and what an operator has said to them."""
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Any
 
 import orjson
 
 from service.instants import format_instant, now_us
-from service.problems import Problem
+from service.store.connection import Connection
+from service.store.errors import Missing
 
 Json = dict[str, Any]
 KEPT = 5000
@@ -72,7 +72,7 @@ def _row(row: tuple[Any, ...]) -> AlarmRow:
 
 
 def write(
-    connection: sqlite3.Connection, twin: int, limit: Limit, start_us: int, stop_us: int | None, body: Json
+    connection: Connection, twin: int, limit: Limit, start_us: int, stop_us: int | None, body: Json
 ) -> AlarmRow | None:
     """Write down that an alarm began, went on or ended; return it if that is news, None if only its body changed.
 
@@ -100,27 +100,27 @@ def write(
     return get(connection, twin, int(row.lastrowid or 0))
 
 
-def end(connection: sqlite3.Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
+def end(connection: Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
     """End an alarm that lasts."""
     connection.execute("UPDATE alarm SET stop_us = max(start_us, ?) WHERE id = ?", (stop_us, number))
     return get(connection, twin, number)
 
 
-def get(connection: sqlite3.Connection, twin: int, number: int) -> AlarmRow:
-    """Return one alarm; Problem 404 if there is none of that number."""
+def get(connection: Connection, twin: int, number: int) -> AlarmRow:
+    """Return one alarm; Missing if there is none of that number."""
     row = connection.execute(_SELECT + "WHERE twin = ? AND id = ?", (twin, number)).fetchone()
     if row is None:
-        raise Problem(404, f"there is no alarm {number}")
+        raise Missing(f"there is no alarm {number}")
     return _row(row)
 
 
-def lasting(connection: sqlite3.Connection, twin: int) -> list[AlarmRow]:
+def lasting(connection: Connection, twin: int) -> list[AlarmRow]:
     """Return the alarms that last."""
     query = _SELECT + "WHERE twin = ? AND stop_us IS NULL ORDER BY id"
     return [_row(row) for row in connection.execute(query, (twin,))]
 
 
-def select(connection: sqlite3.Connection, twin: int, most: int) -> list[AlarmRow]:
+def select(connection: Connection, twin: int, most: int) -> list[AlarmRow]:
     """Return the newest alarms, those first that last and are not shelved, the red ones before the yellow ones."""
     query = (
         _SELECT
@@ -130,7 +130,7 @@ def select(connection: sqlite3.Connection, twin: int, most: int) -> list[AlarmRo
     return [_row(row) for row in connection.execute(query, (twin, now_us(), most))]
 
 
-def acknowledge(connection: sqlite3.Connection, twin: int, number: int, note: str | None) -> AlarmRow:
+def acknowledge(connection: Connection, twin: int, number: int, note: str | None) -> AlarmRow:
     """Note that somebody has seen an alarm; the first one counts, the last note stays."""
     get(connection, twin, number)
     query = "UPDATE alarm SET acknowledged_us = coalesce(acknowledged_us, ?), note = coalesce(?, note) WHERE id = ?"
@@ -138,7 +138,7 @@ def acknowledge(connection: sqlite3.Connection, twin: int, number: int, note: st
     return get(connection, twin, number)
 
 
-def shelve(connection: sqlite3.Connection, twin: int, number: int, until_us: int | None) -> AlarmRow:
+def shelve(connection: Connection, twin: int, number: int, until_us: int | None) -> AlarmRow:
     """Put the limit of an alarm aside until an instant, or take it up again; alarms on the other limits are as ever."""
     limit = get(connection, twin, number).limit
     connection.execute(
@@ -149,13 +149,13 @@ def shelve(connection: sqlite3.Connection, twin: int, number: int, until_us: int
     return get(connection, twin, number)
 
 
-def watched(connection: sqlite3.Connection, twin: int) -> tuple[int, Json]:
+def watched(connection: Connection, twin: int) -> tuple[int, Json]:
     """Return the stream number up to which measured limits were watched, and the state there."""
     row = connection.execute("SELECT seq, state FROM watched WHERE twin = ?", (twin,)).fetchone()
     return (-1, {}) if row is None else (row[0], orjson.loads(row[1]))
 
 
-def watch(connection: sqlite3.Connection, twin: int, seq: int, state: Json) -> None:
+def watch(connection: Connection, twin: int, seq: int, state: Json) -> None:
     """Note up to where measured limits were watched."""
     query = "INSERT OR REPLACE INTO watched (twin, seq, state) VALUES (?, ?, ?)"
     connection.execute(query, (twin, seq, orjson.dumps(state).decode()))

@@ -1,6 +1,5 @@
 """Anomalies: intervals in which a sensor does not behave as its model says."""
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import orjson
 
 from service.instants import format_instant
+from service.store.connection import Connection
 
 WORDS = {
     "residual": "departs from its model",
@@ -65,7 +65,7 @@ NOTICEABLE = 1.1
 
 
 def apply(
-    connection: sqlite3.Connection, twin: int, version: int, changes: Sequence[Change], span_us: tuple[int, int]
+    connection: Connection, twin: int, version: int, changes: Sequence[Change], span_us: tuple[int, int]
 ) -> list[AnomalyRow]:
     """Write down what a detector says about the instants (after, until]; return the intervals that are news.
 
@@ -109,7 +109,7 @@ def apply(
     ]
 
 
-def close(connection: sqlite3.Connection, twin: int, version: int, stop_us: int, until_us: int) -> list[AnomalyRow]:
+def close(connection: Connection, twin: int, version: int, stop_us: int, until_us: int) -> list[AnomalyRow]:
     """End the intervals that began before ``until_us`` and last: nothing is known of what followed ``stop_us`` there."""
     query = """UPDATE anomaly SET stop_us = max(start_us, ?) WHERE twin = ? AND version = ? AND stop_us IS NULL
                AND start_us < ? RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
@@ -117,7 +117,7 @@ def close(connection: sqlite3.Connection, twin: int, version: int, stop_us: int,
 
 
 def _same(
-    connection: sqlite3.Connection, twin: int, version: int, change: Change, after_us: int, taken: set[int]
+    connection: Connection, twin: int, version: int, change: Change, after_us: int, taken: set[int]
 ) -> AnomalyRow | None:
     """Return the anomaly that a change goes on with: of the same start, or else said of a later time and overlapping."""
     until_us = 2**62 if change.stop_us is None else change.stop_us
@@ -131,7 +131,7 @@ def _same(
 
 
 def select(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     start_us: int | None = None,
     stop_us: int | None = None,
@@ -160,7 +160,7 @@ OF_THE_MODEL = ("residual", "joint")
 
 
 def explain(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     sensors: Sequence[str],
     cause: dict[str, Any],
@@ -175,7 +175,7 @@ def explain(
     connection.executemany(query, [(text, twin, *span, sensor) for sensor in sensors])
 
 
-def _known_cause(connection: sqlite3.Connection, twin: int, version: int, change: Change) -> str | None:
+def _known_cause(connection: Connection, twin: int, version: int, change: Change) -> str | None:
     """Return the cause that the same anomaly has under another model, unless the model at hand has that effect already."""
     if change.kind not in OF_THE_MODEL:
         return None
@@ -194,13 +194,13 @@ def _known_cause(connection: sqlite3.Connection, twin: int, version: int, change
     return None if has_it else str(row[0])
 
 
-def open_ids(connection: sqlite3.Connection, twin: int, version: int | None) -> list[int]:
+def open_ids(connection: Connection, twin: int, version: int | None) -> list[int]:
     """Return the numbers of the anomalies of one model version that last."""
     query = "SELECT id FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
     return [number for (number,) in connection.execute(query, (twin, version))]
 
 
-def open_kinds(connection: sqlite3.Connection, twin: int, version: int | None) -> dict[str, list[str]]:
+def open_kinds(connection: Connection, twin: int, version: int | None) -> dict[str, list[str]]:
     """Return the kinds of anomalies of one model version that last, by sensor."""
     query = "SELECT DISTINCT sensor, kind FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
     found: dict[str, list[str]] = {}

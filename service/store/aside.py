@@ -3,7 +3,6 @@
 Nothing reads them but an operator, who may let them into the archive.
 """
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +10,11 @@ from typing import Any
 import numpy as np
 import orjson
 
-from service.frames import Batch
 from service.instants import format_instant, now_us
-from service.problems import Problem
 from service.store import rewrite, samples
+from service.store.batch import Batch
+from service.store.connection import Connection
+from service.store.errors import Conflicting, Missing
 from service.store.merge import ACCEPTED, collapse, merge
 
 UNDO_US = 86_400_000_000
@@ -68,7 +68,7 @@ class Deletion:
         }
 
 
-def quarantine(connection: sqlite3.Connection, twin: int, batch: Batch) -> None:
+def quarantine(connection: Connection, twin: int, batch: Batch) -> None:
     """Put samples into quarantine, each once; of two that disagree about an instant the first one stays."""
     n_channels = batch.values.shape[0]
     span = (int(batch.time_us.min()), int(batch.time_us.max()))
@@ -82,7 +82,7 @@ def quarantine(connection: sqlite3.Connection, twin: int, batch: Batch) -> None:
         _put(connection, twin, None, batch.take(new))
 
 
-def _put(connection: sqlite3.Connection, twin: int, deletion: int | None, batch: Batch) -> None:
+def _put(connection: Connection, twin: int, deletion: int | None, batch: Batch) -> None:
     connection.execute(
         """INSERT INTO aside (twin, deletion, n, first_us, last_us, time, received, value)
            VALUES (?, ?, ?, ?, ?, ?, ?, ?)""",
@@ -99,13 +99,13 @@ def _put(connection: sqlite3.Connection, twin: int, deletion: int | None, batch:
     )
 
 
-def quarantined(connection: sqlite3.Connection, twin: int) -> Quarantine:
+def quarantined(connection: Connection, twin: int) -> Quarantine:
     """Return what lies in quarantine."""
     query = "SELECT coalesce(sum(n), 0), min(first_us), max(last_us) FROM aside WHERE twin = ? AND deletion IS NULL"
     return Quarantine(*connection.execute(query, (twin,)).fetchone())
 
 
-def select(connection: sqlite3.Connection, twin: int, n_channels: int, most: int) -> Batch:
+def select(connection: Connection, twin: int, n_channels: int, most: int) -> Batch:
     """Return the samples in quarantine in the order of their arrival, at most so many."""
     query = "SELECT n, time, value, received FROM aside WHERE twin = ? AND deletion IS NULL ORDER BY id"
     found: list[Batch] = []
@@ -119,7 +119,7 @@ def select(connection: sqlite3.Connection, twin: int, n_channels: int, most: int
 
 
 def delete(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     names: Sequence[str],
     start_us: int | None,
@@ -136,9 +136,7 @@ def delete(
     return made
 
 
-def discard(
-    connection: sqlite3.Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None
-) -> Deletion:
+def discard(connection: Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None) -> Deletion:
     """Take samples out of quarantine for a day, and then for ever."""
     found = _leave_quarantine(connection, twin, n_channels, start_us, stop_us)
     made = _note(connection, twin, "quarantine", start_us, stop_us, None, int(found.time_us.size))
@@ -147,15 +145,13 @@ def discard(
     return made
 
 
-def release(
-    connection: sqlite3.Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None
-) -> Batch:
+def release(connection: Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None) -> Batch:
     """Take samples out of quarantine and return them: they are to be stored in the archive now."""
     return _leave_quarantine(connection, twin, n_channels, start_us, stop_us)
 
 
 def _leave_quarantine(
-    connection: sqlite3.Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None
+    connection: Connection, twin: int, n_channels: int, start_us: int | None, stop_us: int | None
 ) -> Batch:
     start, stop = _span(start_us, stop_us)
     query = """SELECT id, time, value, received FROM aside WHERE twin = ? AND deletion IS NULL
@@ -171,21 +167,21 @@ def _leave_quarantine(
     return samples.joined(found, n_channels)
 
 
-def undo(connection: sqlite3.Connection, twin: int, n_channels: int, number: int) -> tuple[Deletion, Batch]:
+def undo(connection: Connection, twin: int, n_channels: int, number: int) -> tuple[Deletion, Batch]:
     """Return a deletion that is undone now, and the samples that are to be stored in the archive again.
 
     Raises
     ------
-    Problem
-        404 if there is no such deletion, 409 if it was undone or is more than a day old.
+    Missing, Conflicting
+        If there is no such deletion; if it was undone or is more than a day old.
     """
     made = next((row for row in deletions(connection, twin) if row.id == number), None)
     if made is None:
-        raise Problem(404, f"there is no deletion {number}")
+        raise Missing(f"there is no deletion {number}")
     if made.until_us is None:
-        raise Problem(409, f"deletion {number} was undone already")
+        raise Conflicting(f"deletion {number} was undone already")
     if made.until_us < now_us():
-        raise Problem(409, f"deletion {number} is more than a day old: what it deleted is gone")
+        raise Conflicting(f"deletion {number} is more than a day old: what it deleted is gone")
     back = samples.joined([], n_channels)
     if made.place == "quarantine":
         connection.execute("UPDATE aside SET deletion = NULL WHERE deletion = ?", (number,))
@@ -198,7 +194,7 @@ def undo(connection: sqlite3.Connection, twin: int, n_channels: int, number: int
     return next(row for row in deletions(connection, twin) if row.id == number), back
 
 
-def deletions(connection: sqlite3.Connection, twin: int) -> list[Deletion]:
+def deletions(connection: Connection, twin: int) -> list[Deletion]:
     """Return every deletion, the newest first."""
     query = """SELECT id, at_us, place, start_us, stop_us, channels, samples, undone_us FROM deletion
                WHERE twin = ? ORDER BY id DESC"""
@@ -209,7 +205,7 @@ def deletions(connection: sqlite3.Connection, twin: int) -> list[Deletion]:
     return found
 
 
-def expire(connection: sqlite3.Connection) -> int:
+def expire(connection: Connection) -> int:
     """Forget what was deleted more than a day ago; return how many samples that were. The deletions stay on record."""
     late = "deletion IN (SELECT id FROM deletion WHERE at_us < ?)"
     before_us = now_us() - UNDO_US
@@ -220,7 +216,7 @@ def expire(connection: sqlite3.Connection) -> int:
 
 
 def _note(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     place: str,
     start_us: int | None,

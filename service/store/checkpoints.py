@@ -1,10 +1,11 @@
 """Checkpoints: states of the assimilation, from which it goes on after a restart or before a late sample."""
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Any
 
 import orjson
+
+from service.store.connection import Connection
 
 EVERY = 500
 """Of older checkpoints one is kept for about so many samples."""
@@ -22,7 +23,7 @@ class Checkpoint:
 
 
 def put(
-    connection: sqlite3.Connection, twin: int, version: int, checkpoint: Checkpoint, *, keep_previous: bool = False
+    connection: Connection, twin: int, version: int, checkpoint: Checkpoint, *, keep_previous: bool = False
 ) -> None:
     """Store a checkpoint, and forget the previous one unless it is worth keeping."""
     rows = connection.execute(
@@ -38,19 +39,19 @@ def put(
     _thin(connection, twin, version)
 
 
-def _thin(connection: sqlite3.Connection, twin: int, version: int) -> None:
+def _thin(connection: Connection, twin: int, version: int) -> None:
     query = "SELECT time_us FROM checkpoint WHERE twin = ? AND version = ? ORDER BY time_us"
     times = [time_us for (time_us,) in connection.execute(query, (twin, version))]
     if len(times) > MOST:
         _delete(connection, twin, version, times[1 : MOST // 2 : 2])
 
 
-def _delete(connection: sqlite3.Connection, twin: int, version: int, times: list[int]) -> None:
+def _delete(connection: Connection, twin: int, version: int, times: list[int]) -> None:
     query = "DELETE FROM checkpoint WHERE twin = ? AND version = ? AND time_us = ?"
     connection.executemany(query, [(twin, version, time_us) for time_us in times])
 
 
-def before(connection: sqlite3.Connection, twin: int, version: int, time_us: int | None = None) -> Checkpoint | None:
+def before(connection: Connection, twin: int, version: int, time_us: int | None = None) -> Checkpoint | None:
     """Return the last checkpoint before an instant, or the last of all."""
     row = connection.execute(
         """SELECT time_us, n, state FROM checkpoint WHERE twin = ? AND version = ? AND time_us < ?
@@ -60,7 +61,19 @@ def before(connection: sqlite3.Connection, twin: int, version: int, time_us: int
     return None if row is None else Checkpoint(row[0], row[1], orjson.loads(row[2]))
 
 
-def forget(connection: sqlite3.Connection, twin: int, version: int, after_us: int, until_us: int) -> None:
+def floor(connection: Connection, twin: int, version: int) -> int | None:
+    """Return the first instant that a version's assimilation looks at; None: it begins with the archive."""
+    query = "SELECT at_us FROM floor WHERE twin = ? AND version = ?"
+    row = connection.execute(query, (twin, version)).fetchone()
+    return None if row is None else int(row[0])
+
+
+def raise_floor(connection: Connection, twin: int, version: int, at_us: int) -> None:
+    """Let a version's assimilation look at nothing before an instant from now on."""
+    connection.execute("INSERT OR REPLACE INTO floor (twin, version, at_us) VALUES (?, ?, ?)", (twin, version, at_us))
+
+
+def forget(connection: Connection, twin: int, version: int, after_us: int, until_us: int) -> None:
     """Forget the checkpoints after < time < until: they did not know of a late sample."""
     query = "DELETE FROM checkpoint WHERE twin = ? AND version = ? AND time_us > ? AND time_us < ?"
     connection.execute(query, (twin, version, after_us, until_us))

@@ -18,8 +18,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from service.problems import Problem
-from service.store.lock import FileLock, StoreError
+from service.store.connection import Connection
+from service.store.errors import DiskFull, StoreError
+from service.store.lock import FileLock
 from service.store.migrations import migrate
 
 log = logging.getLogger("service.store")
@@ -31,6 +32,7 @@ SHARE = 256
 """Most operations that share one commit."""
 READERS = 4
 PRAGMAS = (
+    "auto_vacuum = INCREMENTAL",  # holds for new files; others keep what they were made with
     "journal_mode = WAL",
     "synchronous = FULL",
     "foreign_keys = ON",
@@ -44,7 +46,7 @@ FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR
 class _Order:
     """One operation on its way to the writer, and where its result goes."""
 
-    operation: Callable[[sqlite3.Connection], Any]
+    operation: Callable[[Connection], Any]
     then: Callable[[Any, BaseException | None], None]
     result: Any = None
     error: BaseException | None = None
@@ -64,19 +66,17 @@ class Database:
             raise StoreError(f"{path}: cannot be used as a database ({error}); check TWIN_DATABASE_URL") from error
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._local = threading.local()
-        self._opened: list[sqlite3.Connection] = []
+        self._opened: list[Connection] = []
         self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="reader")
         self._writer = threading.Thread(target=self._write_forever, name="writer", daemon=True)
         self._writer.start()
 
-    async def write(
-        self, operation: Callable[Concatenate[sqlite3.Connection, P], T], *args: P.args, **kwargs: P.kwargs
-    ) -> T:
+    async def write(self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return the operation's result once it is durably committed."""
         return await asyncio.wrap_future(self.submit(operation, *args, **kwargs))
 
     def submit(
-        self, operation: Callable[Concatenate[sqlite3.Connection, P], T], *args: P.args, **kwargs: P.kwargs
+        self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs
     ) -> "Future[T]":
         """Queue an operation for the writer, from any thread."""
         answer: Future[T] = Future()
@@ -86,16 +86,14 @@ class Database:
     def submit_then(
         self,
         then: Callable[[T, BaseException | None], None],
-        operation: Callable[Concatenate[sqlite3.Connection, P], T],
+        operation: Callable[Concatenate[Connection, P], T],
         *args: P.args,
         **kwargs: P.kwargs,
     ) -> None:
         """The same; after the commit the writer calls ``then`` with the result, or with the error."""
         self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), then))
 
-    async def read(
-        self, operation: Callable[Concatenate[sqlite3.Connection, P], T], *args: P.args, **kwargs: P.kwargs
-    ) -> T:
+    async def read(self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run an operation on a read-only snapshot, beside the writer and other readers."""
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._readers, lambda: self._read(lambda c: operation(c, *args, **kwargs)))
@@ -115,8 +113,8 @@ class Database:
         """Operations that wait for the writer."""
         return self._orders.qsize()
 
-    def _read(self, operation: Callable[[sqlite3.Connection], T]) -> T:
-        connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
+    def _read(self, operation: Callable[[Connection], T]) -> T:
+        connection: Connection | None = getattr(self._local, "connection", None)
         if connection is None:
             connection = _connect(self._path, read_only=True)
             self._local.connection = connection
@@ -220,11 +218,11 @@ def _refusal(error: sqlite3.Error) -> Exception:
     name = getattr(error, "sqlite_errorname", "")
     if name.startswith(FULL):
         log.error("the disk is full; nothing of the write was stored", extra={"sqlite": name})
-        return Problem(507, "the disk is full: nothing of this request was stored; free some space and send it again")
+        return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
     return error
 
 
-def _open(path: Path) -> sqlite3.Connection:
+def _open(path: Path) -> Connection:
     """Return the writer's connection to a database of the present schema."""
     connection = _connect(path)
     try:
@@ -235,7 +233,7 @@ def _open(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
+def _connect(path: Path, read_only: bool = False) -> Connection:
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
     settings = PRAGMAS + (("query_only = ON",) if read_only else ())
     try:

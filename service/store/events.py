@@ -1,13 +1,14 @@
 """Events of a twin's stream that are not samples: jobs, models, anomalies, each with its number."""
 
-import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import orjson
 
-from service.store.gone import TwinGone
+from service.store import webhooks
+from service.store.connection import Connection
+from service.store.errors import TwinGone
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class Event:
     body: dict[str, Any]
 
 
-def claim(connection: sqlite3.Connection, twin: int, count: int) -> int:
+def claim(connection: Connection, twin: int, count: int) -> int:
     """Reserve ``count`` consecutive numbers of a twin's stream; return the first."""
     row = connection.execute("UPDATE head SET seq = seq + ? WHERE twin = ? RETURNING seq", (count, twin)).fetchone()
     if row is None:
@@ -29,17 +30,19 @@ def claim(connection: sqlite3.Connection, twin: int, count: int) -> int:
 
 
 def append(
-    connection: sqlite3.Connection, twin: int, time_us: int, messages: Sequence[tuple[str, dict[str, Any]]]
+    connection: Connection, twin: int, time_us: int, messages: Sequence[tuple[str, dict[str, Any]]]
 ) -> list[Event]:
     """Store messages given as (type, body) and return them with their numbers."""
     first = claim(connection, twin, len(messages))
     events = [Event(first + i, time_us, kind, body) for i, (kind, body) in enumerate(messages)]
     rows = [(twin, event.seq, time_us, event.type, orjson.dumps(event.body).decode()) for event in events]
     connection.executemany("INSERT INTO event (twin, seq, time_us, type, body) VALUES (?, ?, ?, ?, ?)", rows)
+    for event in events:
+        webhooks.enqueue(connection, twin, event.seq, time_us, event.type, event.body)
     return events
 
 
-def since_seq(connection: sqlite3.Connection, twin: int, after_seq: int) -> list[Event]:
+def since_seq(connection: Connection, twin: int, after_seq: int) -> list[Event]:
     """Return the events after one number, in order."""
     query = "SELECT seq, time_us, type, body FROM event WHERE twin = ? AND seq > ? ORDER BY seq"
     return [

@@ -1,14 +1,13 @@
 """Jobs: what was asked for, how far it got, what came of it."""
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Any
 
 import orjson
 
 from service.instants import format_instant, now_us
-from service.problems import Problem
-from service.store.gone import TwinGone
+from service.store.connection import Connection
+from service.store.errors import Missing, TwinGone
 
 KEPT = 200
 """Jobs of one kind that are kept per twin; older ones are forgotten."""
@@ -49,11 +48,11 @@ _SELECT = """SELECT id, twin, kind, state, progress, message, request, created_u
              FROM job """
 
 
-def create(connection: sqlite3.Connection, twin: int, job: str, kind: str, request: dict[str, Any]) -> JobRow:
+def create(connection: Connection, twin: int, job: str, kind: str, request: dict[str, Any]) -> JobRow:
     """Queue a job."""
     made = connection.execute(
         """INSERT INTO job (id, twin, kind, state, request, created_us, message)
-           SELECT ?, id, ?, 'queued', ?, ?, ? FROM twin WHERE id = ?""",
+           SELECT ?, id, ?, 'queued', ?, ?, ? FROM twin WHERE id = ? AND gone_us IS NULL""",
         (job, kind, orjson.dumps(request).decode(), now_us(), "waiting for a free worker", twin),
     )
     if made.rowcount == 0:
@@ -66,27 +65,27 @@ def create(connection: sqlite3.Connection, twin: int, job: str, kind: str, reque
     return get(connection, twin, kind, job)
 
 
-def get(connection: sqlite3.Connection, twin: int, kind: str, job: str) -> JobRow:
-    """Return one job; Problem 404 if the twin has none of that id and kind."""
+def get(connection: Connection, twin: int, kind: str, job: str) -> JobRow:
+    """Return one job; Missing if the twin has none of that id and kind."""
     row = connection.execute(_SELECT + "WHERE id = ? AND twin = ? AND kind = ?", (job, twin, kind)).fetchone()
     if row is None:
-        raise Problem(404, f"no {kind} '{job}'")
+        raise Missing(f"no {kind} '{job}'")
     return JobRow(*row)
 
 
-def select(connection: sqlite3.Connection, twin: int, kind: str) -> list[JobRow]:
+def select(connection: Connection, twin: int, kind: str) -> list[JobRow]:
     """Return the jobs of one kind, the newest first."""
     query = _SELECT + "WHERE twin = ? AND kind = ? ORDER BY number DESC"
     return [JobRow(*row) for row in connection.execute(query, (twin, kind))]
 
 
-def begin(connection: sqlite3.Connection, job: str) -> None:
+def begin(connection: Connection, job: str) -> None:
     """Mark a queued job as running."""
     query = "UPDATE job SET state = 'running', started_us = ?, message = 'starting' WHERE id = ? AND state = 'queued'"
     connection.execute(query, (now_us(), job))
 
 
-def report(connection: sqlite3.Connection, job: str, progress: float, message: str) -> None:
+def report(connection: Connection, job: str, progress: float, message: str) -> None:
     """Note how far a running job is; progress never goes back."""
     connection.execute(
         "UPDATE job SET progress = max(progress, ?), message = ? WHERE id = ? AND state = 'running'",
@@ -95,7 +94,7 @@ def report(connection: sqlite3.Connection, job: str, progress: float, message: s
 
 
 def finish(
-    connection: sqlite3.Connection,
+    connection: Connection,
     job: str,
     state: str,
     message: str,
@@ -113,14 +112,14 @@ def finish(
     return cursor.rowcount == 1
 
 
-def page(connection: sqlite3.Connection, twin: int, kind: str, job: str) -> str | None:
+def page(connection: Connection, twin: int, kind: str, job: str) -> str | None:
     """Return the page that a job left."""
     get(connection, twin, kind, job)
     row = connection.execute("SELECT page FROM job WHERE id = ?", (job,)).fetchone()
     return None if row is None else row[0]
 
 
-def fail_interrupted(connection: sqlite3.Connection) -> int:
+def fail_interrupted(connection: Connection) -> int:
     """Mark the jobs that a stopped service left behind as failed; return how many there were."""
     cursor = connection.execute(
         """UPDATE job SET state = 'failed', message = 'interrupted: the service stopped; start it again',

@@ -4,12 +4,7 @@ import fcntl
 import os
 from pathlib import Path
 
-from twin_core.errors import TwinError
-
-
-class StoreError(TwinError):
-    """The store cannot be opened."""
-
+from service.store.errors import StoreError
 
 _held: set[tuple[int, int]] = set()
 """Device and inode of each database of this process: closing one a second time would drop SQLite's own locks on it."""

@@ -3,16 +3,18 @@
 import sqlite3
 from collections.abc import Callable
 
-Step = Callable[[sqlite3.Connection], None]
+from service.store.connection import Connection
+
+Step = Callable[[Connection], None]
 
 
-def _run(connection: sqlite3.Connection, script: str) -> None:
+def _run(connection: Connection, script: str) -> None:
     """Execute statements one by one: ``executescript`` would commit the transaction they belong to."""
     for statement in filter(str.strip, script.split(";")):
         connection.execute(statement)
 
 
-def _twins_and_samples(connection: sqlite3.Connection) -> None:
+def _twins_and_samples(connection: Connection) -> None:
     _run(
         connection,
         """
@@ -48,7 +50,7 @@ def _twins_and_samples(connection: sqlite3.Connection) -> None:
     )
 
 
-def _models_and_jobs(connection: sqlite3.Connection) -> None:
+def _models_and_jobs(connection: Connection) -> None:
     _run(
         connection,
         """
@@ -98,7 +100,7 @@ def _models_and_jobs(connection: sqlite3.Connection) -> None:
     )
 
 
-def _residuals_and_anomalies(connection: sqlite3.Connection) -> None:
+def _residuals_and_anomalies(connection: Connection) -> None:
     _run(
         connection,
         """
@@ -140,7 +142,7 @@ def _residuals_and_anomalies(connection: sqlite3.Connection) -> None:
     )
 
 
-def _outlines(connection: sqlite3.Connection) -> None:
+def _outlines(connection: Connection) -> None:
     """Add outlines of large chunks; chunks that were stored before have none and are read whole."""
     for table in ("chunk", "residual"):
         _run(
@@ -156,7 +158,7 @@ def _outlines(connection: sqlite3.Connection) -> None:
         )
 
 
-def _clocks(connection: sqlite3.Connection) -> None:
+def _clocks(connection: Connection) -> None:
     """Add receive times (chunks of earlier releases have none), and a place for samples that are set aside.
 
     ``head.revision`` grows whenever stored samples are taken away: what was computed from them before is outdated then.
@@ -194,7 +196,7 @@ def _clocks(connection: sqlite3.Connection) -> None:
     )
 
 
-def _alarms(connection: sqlite3.Connection) -> None:
+def _alarms(connection: Connection) -> None:
     """Add alarms of limits, and how far the archive was watched."""
     _run(
         connection,
@@ -224,6 +226,66 @@ def _alarms(connection: sqlite3.Connection) -> None:
     )
 
 
+def _years(connection: Connection) -> None:
+    """Add what a twin needs that is kept for years: revisions, retention, an audit log, webhooks, and bounds on what is read.
+
+    ``residual.n_rows`` tells residuals in single precision; those of earlier releases have none.
+    ``twin.gone_us`` marks a deleted twin whose rows are removed bit by bit.
+    """
+    _run(
+        connection,
+        """
+        ALTER TABLE residual ADD COLUMN n_rows INTEGER;
+        ALTER TABLE twin ADD COLUMN gone_us INTEGER;
+        ALTER TABLE twin ADD COLUMN revision INTEGER NOT NULL DEFAULT 1;
+        ALTER TABLE twin ADD COLUMN retention TEXT NOT NULL DEFAULT '{}';
+        CREATE TABLE revision (
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            number INTEGER NOT NULL,
+            at_us INTEGER NOT NULL,
+            specification TEXT NOT NULL,
+            PRIMARY KEY (twin, number)
+        ) WITHOUT ROWID;
+        CREATE TABLE floor (
+            twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
+            version INTEGER NOT NULL,
+            at_us INTEGER NOT NULL,
+            PRIMARY KEY (twin, version)
+        ) WITHOUT ROWID;
+        CREATE TABLE audit (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            at_us INTEGER NOT NULL,
+            who TEXT NOT NULL,
+            method TEXT NOT NULL,
+            path TEXT NOT NULL,
+            status INTEGER NOT NULL,
+            client TEXT NOT NULL,
+            detail TEXT NOT NULL
+        );
+        CREATE TABLE webhook (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            url TEXT NOT NULL,
+            secret TEXT NOT NULL,
+            twins TEXT,
+            types TEXT,
+            created_us INTEGER NOT NULL
+        );
+        CREATE TABLE delivery (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            webhook INTEGER NOT NULL REFERENCES webhook(id) ON DELETE CASCADE,
+            created_us INTEGER NOT NULL,
+            type TEXT NOT NULL,
+            body TEXT NOT NULL,
+            attempts INTEGER NOT NULL DEFAULT 0,
+            next_us INTEGER,
+            state TEXT NOT NULL DEFAULT 'waiting',
+            reason TEXT NOT NULL DEFAULT ''
+        );
+        CREATE INDEX delivery_due ON delivery (state, next_us);
+        """,
+    )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
@@ -231,10 +293,11 @@ STEPS: tuple[tuple[str, Step], ...] = (
     ("outlines", _outlines),
     ("clocks", _clocks),
     ("alarms", _alarms),
+    ("years", _years),
 )
 
 
-def migrate(connection: sqlite3.Connection) -> list[str]:
+def migrate(connection: Connection) -> list[str]:
     """Apply the steps that this database has not seen; return their names.
 
     Raises

@@ -1,6 +1,5 @@
 """Model versions: immutable, with their provenance, and the log of which one was active when."""
 
-import sqlite3
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -8,7 +7,8 @@ from typing import Any
 import orjson
 
 from service.instants import format_instant, now_us, parse_instant
-from service.problems import BadField
+from service.store.connection import Connection
+from service.store.errors import Missing
 from twin_core.telemetry import GAP_STEPS
 
 
@@ -57,6 +57,11 @@ class Active:
         """Longest time step of its rollouts."""
         return float(self.parsed()["max_step_s"])
 
+    @cached_property
+    def specification(self) -> dict[str, Any]:
+        """The specification that it was made from."""
+        return dict(self.parsed()["spec"])
+
     @property
     def longest_gap_us(self) -> float:
         """Beyond a longer interval the assimilation starts anew."""
@@ -74,9 +79,7 @@ _SELECT = """
 """
 
 
-def add(
-    connection: sqlite3.Connection, twin: int, source: str, summary: dict[str, Any], document: dict[str, Any]
-) -> int:
+def add(connection: Connection, twin: int, source: str, summary: dict[str, Any], document: dict[str, Any]) -> int:
     """Store a new version and return its number."""
     row = connection.execute("SELECT coalesce(max(version), 0) + 1 FROM model WHERE twin = ?", (twin,)).fetchone()
     connection.execute(
@@ -86,24 +89,26 @@ def add(
     return int(row[0])
 
 
-def activate(connection: sqlite3.Connection, twin: int, version: int, reason: str) -> None:
-    """Make a version the active one; Problem 404 if there is none of that number."""
+def activate(connection: Connection, twin: int, version: int, reason: str) -> None:
+    """Make a version the active one; Missing if there is none of that number."""
     get(connection, twin, version)
     connection.execute(
         "INSERT INTO activation (twin, version, at_us, reason) VALUES (?, ?, ?, ?)", (twin, version, now_us(), reason)
     )
 
 
-def select(connection: sqlite3.Connection, twin: int) -> list[ModelRow]:
+def select(connection: Connection, twin: int) -> list[ModelRow]:
     """Return every version, the oldest first."""
     return [_row(row) for row in connection.execute(_SELECT + "ORDER BY version", (twin,))]
 
 
-def get(connection: sqlite3.Connection, twin: int, version: int) -> ModelRow:
-    """Return one version; Problem 404 if there is none of that number."""
+def get(connection: Connection, twin: int, version: int) -> ModelRow:
+    """Return one version; Missing if there is none of that number."""
     row = connection.execute(_SELECT + "AND version = ?", (twin, version)).fetchone()
     if row is None:
-        raise BadField("version", f"there is no model version {version}", 404)
+        raise Missing(
+            f"version: there is no model version {version}", [("version", f"there is no model version {version}")]
+        )
     return _row(row)
 
 
@@ -112,14 +117,14 @@ def _row(row: tuple[Any, ...]) -> ModelRow:
     return ModelRow(version, created_us, source, summary, bool(active))
 
 
-def document(connection: sqlite3.Connection, twin: int, version: int) -> dict[str, Any]:
-    """Return the model itself; Problem 404 if there is none of that number."""
+def document(connection: Connection, twin: int, version: int) -> dict[str, Any]:
+    """Return the model itself; Missing if there is none of that number."""
     get(connection, twin, version)
     query = "SELECT document FROM model WHERE twin = ? AND version = ?"
     return dict(orjson.loads(connection.execute(query, (twin, version)).fetchone()[0]))
 
 
-def activations(connection: sqlite3.Connection, twin: int) -> list[dict[str, Any]]:
+def activations(connection: Connection, twin: int) -> list[dict[str, Any]]:
     """Return the log of activations, the newest first."""
     query = "SELECT version, at_us, reason FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 100"
     return [
@@ -128,7 +133,7 @@ def activations(connection: sqlite3.Connection, twin: int) -> list[dict[str, Any
     ]
 
 
-def active(connection: sqlite3.Connection, twin: int) -> Active | None:
+def active(connection: Connection, twin: int) -> Active | None:
     """Return the active model, or None before the first activation."""
     row = connection.execute(
         """SELECT model.version, model.summary, model.document FROM activation
@@ -139,7 +144,7 @@ def active(connection: sqlite3.Connection, twin: int) -> Active | None:
     return None if row is None else Active(row[0], orjson.loads(row[1]), row[2])
 
 
-def first_us(connection: sqlite3.Connection, twin: int) -> int:
+def first_us(connection: Connection, twin: int) -> int:
     """Return the first instant of a twin's archive, where the time axis of a new model begins; 0 if it is empty."""
     row = connection.execute("SELECT first_us FROM head WHERE twin = ?", (twin,)).fetchone()
     return int(row[0] or 0)

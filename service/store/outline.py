@@ -4,13 +4,14 @@ The extremes of a union are among the extremes of its parts: a plot drawn from o
 all samples would. Samples and residuals have the same kind of chunks, so both have outlines.
 """
 
-import sqlite3
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from service.store import blobs
+from service.store.connection import Connection
 from service.store.merge import collapse
 
 Table = Literal["chunk", "residual"]
@@ -30,7 +31,7 @@ class Part:
 
 
 def put(
-    connection: sqlite3.Connection, table: Table, chunk: int, time_us: NDArray[np.int64], values: NDArray[np.float64]
+    connection: Connection, table: Table, chunk: int, time_us: NDArray[np.int64], values: NDArray[np.float64]
 ) -> None:
     """Store the outline of a chunk, unless the chunk is small.
 
@@ -49,7 +50,7 @@ def put(
             chunk,
             int(time_us.size),
             np.ascontiguousarray(time_us[kept], dtype="<i8").data,
-            np.ascontiguousarray(values[:, kept], dtype="<f8").data,
+            np.ascontiguousarray(values[:, kept], dtype="<f8" if table == "chunk" else "<f4").data,
         ),
     )
 
@@ -71,7 +72,7 @@ def _extremes(values: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def parts(
-    connection: sqlite3.Connection,
+    connection: Connection,
     table: Table,
     spans: list[tuple[int, int, int]],
     start_us: int,
@@ -102,6 +103,7 @@ def parts(
         if row is None:
             found.append(Part(chunk, 0, None, None))
         else:
-            values = np.frombuffer(row[2], dtype="<f8").reshape(n_rows, -1)
-            found.append(Part(chunk, row[0], np.frombuffer(row[1], dtype="<i8"), values))
+            time_us = blobs.instants(row[1])
+            read = blobs.matrix if table == "chunk" else blobs.single
+            found.append(Part(chunk, row[0], time_us, read(row[2], n_rows, time_us.size)))
     return found

@@ -1,16 +1,17 @@
 """Residuals of one model version: chunks like those of samples, replaced from an instant on when late samples arrive.
 
-The value array has 2 n_sensors + 1 rows: innovations in K, their predicted standard deviations in K, and the NIS.
-Residuals of samples that were assimilated in arrears carry stream number 0: nobody was told about them one by one.
+The value array has 2 n_sensors + 1 rows in single precision: innovations in K, their predicted standard deviations in K,
+and the NIS. They take less room than the samples that they belong to. Residuals of samples that were assimilated in arrears
+carry stream number 0, which is not stored: nobody was told about them one by one.
 """
 
-import sqlite3
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.store import outline
+from service.store import blobs, outline
+from service.store.connection import Connection
 
 MOST_SMALL_CHUNKS = 64
 """So many small chunks in a row are rewritten as one."""
@@ -53,10 +54,11 @@ def _pack(residuals: Residuals) -> NDArray[np.float64]:
 
 
 def _unpack(n_sensors: int, version: int, seq: bytes, time: bytes, value: bytes) -> Residuals:
-    matrix = np.frombuffer(value, dtype="<f8").reshape(2 * n_sensors + 1, -1)
+    time_us = blobs.instants(time)
+    matrix = blobs.single(value, 2 * n_sensors + 1, time_us.size)
     return Residuals(
-        np.frombuffer(seq, dtype="<i8"),
-        np.frombuffer(time, dtype="<i8"),
+        blobs.instants(seq) if seq else np.zeros_like(time_us),
+        time_us,
         matrix[:n_sensors],
         matrix[n_sensors:-1],
         matrix[-1],
@@ -64,7 +66,7 @@ def _unpack(n_sensors: int, version: int, seq: bytes, time: bytes, value: bytes)
     )
 
 
-def append(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> None:
+def append(connection: Connection, twin: int, residuals: Residuals) -> None:
     """Store residuals, and gather the last chunks into one if there are many small ones."""
     if residuals.time_us.size == 0:
         return
@@ -73,7 +75,7 @@ def append(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> N
         _compact(connection, twin, residuals.version, residuals.innovation_K.shape[0])
 
 
-def _compact(connection: sqlite3.Connection, twin: int, version: int, n_sensors: int) -> None:
+def _compact(connection: Connection, twin: int, version: int, n_sensors: int) -> None:
     """Rewrite the last chunks as one if all of them are small: samples that come one by one make one chunk each."""
     rows = connection.execute(
         "SELECT id, n FROM residual WHERE twin = ? AND version = ? ORDER BY last_us DESC LIMIT ?",
@@ -89,11 +91,11 @@ def _compact(connection: sqlite3.Connection, twin: int, version: int, n_sensors:
     _insert(connection, twin, _join(found, n_sensors, version))
 
 
-def _insert(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> None:
+def _insert(connection: Connection, twin: int, residuals: Residuals) -> None:
     packed = _pack(residuals)
     row = connection.execute(
-        """INSERT INTO residual (twin, version, n, first_us, last_us, last_seq, seq, time, value)
-           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)""",
+        """INSERT INTO residual (twin, version, n, first_us, last_us, last_seq, seq, time, value, n_rows)
+           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)""",
         (
             twin,
             residuals.version,
@@ -101,17 +103,16 @@ def _insert(connection: sqlite3.Connection, twin: int, residuals: Residuals) -> 
             int(residuals.time_us[0]),
             int(residuals.time_us[-1]),
             int(residuals.seq.max()),
-            np.ascontiguousarray(residuals.seq, dtype="<i8").data,
+            np.ascontiguousarray(residuals.seq, dtype="<i8").data if residuals.seq.any() else b"",
             np.ascontiguousarray(residuals.time_us, dtype="<i8").data,
-            np.ascontiguousarray(packed, dtype="<f8").data,
+            np.ascontiguousarray(packed, dtype="<f4").data,
+            packed.shape[0],
         ),
     )
     outline.put(connection, "residual", int(row.lastrowid or 0), residuals.time_us, packed)
 
 
-def forget(
-    connection: sqlite3.Connection, twin: int, version: int, n_sensors: int, after_us: int, until_us: int
-) -> None:
+def forget(connection: Connection, twin: int, version: int, n_sensors: int, after_us: int, until_us: int) -> None:
     """Forget one version's residuals of after < time < until."""
     rows = connection.execute(
         """SELECT id, seq, time, value FROM residual
@@ -125,7 +126,7 @@ def forget(
 
 
 def select(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     version: int,
     n_sensors: int,
@@ -143,7 +144,7 @@ def select(
 
 
 def overview(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     version: int,
     n_sensors: int,
@@ -189,7 +190,7 @@ def _join(parts: list[Residuals], n_sensors: int, version: int) -> Residuals:
     )
 
 
-def since_seq(connection: sqlite3.Connection, twin: int, n_sensors: int, after_seq: int) -> list[Residuals]:
+def since_seq(connection: Connection, twin: int, n_sensors: int, after_seq: int) -> list[Residuals]:
     """Return the residuals after one stream number, in stretches of one version each."""
     query = "SELECT version, seq, time, value FROM residual WHERE twin = ? AND last_seq > ? ORDER BY last_seq"
     found = [

@@ -1,16 +1,16 @@
 """Taking samples out of the archive: the one thing that changes what a chunk holds."""
 
-import sqlite3
 from collections.abc import Sequence
 
 import numpy as np
 
-from service.frames import Batch
 from service.store import residuals, samples
+from service.store.batch import Batch
+from service.store.connection import Connection
 
 
 def take_out(
-    connection: sqlite3.Connection, twin: int, n_channels: int, start_us: int, stop_us: int, rows: Sequence[int] | None
+    connection: Connection, twin: int, n_channels: int, start_us: int, stop_us: int, rows: Sequence[int] | None
 ) -> Batch:
     """Take the samples with start <= time < stop out of the archive and return them, with NaN for what stays.
 
@@ -51,7 +51,7 @@ def take_out(
     return found
 
 
-def _move_head(connection: sqlite3.Connection, twin: int, n_instants: int) -> None:
+def _move_head(connection: Connection, twin: int, n_instants: int) -> None:
     """Let the head of the archive say what is left of it."""
     connection.execute(
         """UPDATE head SET revision = revision + 1, samples = samples - ?,
@@ -62,7 +62,7 @@ def _move_head(connection: sqlite3.Connection, twin: int, n_instants: int) -> No
     samples.count_small(connection, twin)
 
 
-def _forget(connection: sqlite3.Connection, twin: int, start_us: int, stop_us: int) -> None:
+def _forget(connection: Connection, twin: int, start_us: int, stop_us: int) -> None:
     """Forget what was derived from samples in an interval, by every model; what follows is assimilated anew."""
     connection.execute("DELETE FROM checkpoint WHERE twin = ? AND time_us >= ?", (twin, start_us))
     query = "DELETE FROM anomaly WHERE twin = ? AND start_us >= ? AND start_us < ?"
@@ -70,7 +70,7 @@ def _forget(connection: sqlite3.Connection, twin: int, start_us: int, stop_us: i
     query = "DELETE FROM alarm WHERE twin = ? AND origin = 'measured' AND start_us >= ? AND start_us < ?"
     connection.execute(query, (twin, start_us, stop_us))
     connection.execute("DELETE FROM watched WHERE twin = ?", (twin,))
-    query = """SELECT DISTINCT version, length(value) / (8 * n) FROM residual
+    query = """SELECT DISTINCT version, coalesce(n_rows, length(value) / (8 * n)) FROM residual
                WHERE twin = ? AND last_us >= ? AND first_us < ?"""
     for version, n_rows in connection.execute(query, (twin, start_us, stop_us)).fetchall():
         residuals.forget(connection, twin, version, (n_rows - 1) // 2, start_us - 1, stop_us)

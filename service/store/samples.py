@@ -4,7 +4,6 @@ A chunk holds four arrays as little-endian bytes: the stream numbers, the instan
 the values (n_channels, n_times). Small chunks are rewritten as one from time to time; what they hold never changes.
 """
 
-import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,9 +12,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from service.frames import Batch
 from service.store import outline
-from service.store.gone import TwinGone
+from service.store.batch import Batch
+from service.store.blobs import instants, matrix
+from service.store.connection import Connection
+from service.store.errors import TwinGone
 from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
 
 SMALL = 512
@@ -70,7 +71,7 @@ class Samples:
     values: NDArray[np.float64]
 
 
-def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
+def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
     if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
@@ -81,7 +82,7 @@ def append(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
     return _merge_in(connection, twin, batch)
 
 
-def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receipt:
+def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch that is late, unordered or empty."""
     row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
@@ -101,7 +102,7 @@ def _merge_in(connection: sqlite3.Connection, twin: int, batch: Batch) -> Receip
 
 
 def _advance(
-    connection: sqlite3.Connection, twin: int, batch: Batch, n_instants: int, *, after_all: bool
+    connection: Connection, twin: int, batch: Batch, n_instants: int, *, after_all: bool
 ) -> tuple[int, int, int] | None:
     """Move the head of the archive and return its number, small chunks and small rows.
 
@@ -123,7 +124,7 @@ def _advance(
     return row
 
 
-def _write(connection: sqlite3.Connection, twin: int, batch: Batch, head: tuple[int, int, int]) -> None:
+def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int, int]) -> None:
     """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
     seq, small_chunks, small_rows = head
     n = int(batch.time_us.size)
@@ -132,7 +133,7 @@ def _write(connection: sqlite3.Connection, twin: int, batch: Batch, head: tuple[
         _compact(connection, twin, values_rows=batch.values.shape[0])
 
 
-def insert(connection: sqlite3.Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
+def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
     """Store a chunk as it is; the head of the archive has been moved already."""
     row = connection.execute(
         """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
@@ -155,18 +156,25 @@ def insert(connection: sqlite3.Connection, twin: int, seq: NDArray[np.int64], ba
 def unpack(n_rows: int, time: bytes, value: bytes, received: bytes | None) -> Batch:
     """Return what a chunk holds."""
     arrived_us = None if received is None else np.frombuffer(received, dtype="<i8")
-    return Batch(np.frombuffer(time, dtype="<i8"), _matrix(value, n_rows), arrived_us)
+    time_us = instants(time)
+    return Batch(time_us, matrix(value, n_rows, time_us.size), arrived_us)
+
+
+def _widened(values: NDArray[np.float64], n_rows: int) -> NDArray[np.float64]:
+    """Return values with rows of missing ones for channels that the twin has got since."""
+    missing = n_rows - values.shape[0]
+    return np.vstack([values, np.full((missing, values.shape[1]), np.nan)]) if missing else values
 
 
 def joined(batches: Sequence[Batch], n_rows: int) -> Batch:
     """Return batches as one, in their order."""
     times = [np.empty(0, dtype=np.int64), *(batch.time_us for batch in batches)]
-    values = [np.empty((n_rows, 0)), *(batch.values for batch in batches)]
+    values = [np.empty((n_rows, 0)), *(_widened(batch.values, n_rows) for batch in batches)]
     received = [np.empty(0, dtype=np.int64), *(batch.received for batch in batches)]
     return Batch(np.concatenate(times), np.concatenate(values, axis=1), np.concatenate(received))
 
 
-def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> None:
+def _compact(connection: Connection, twin: int, values_rows: int) -> None:
     """Rewrite the small chunks in the order of time, cut where time makes a jump, so that none spans idle years."""
     rows = connection.execute(
         "SELECT id, seq, time, value, received FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
@@ -187,7 +195,7 @@ def _compact(connection: sqlite3.Connection, twin: int, values_rows: int) -> Non
     count_small(connection, twin)
 
 
-def count_small(connection: sqlite3.Connection, twin: int) -> None:
+def count_small(connection: Connection, twin: int) -> None:
     """Note how many small chunks there are, and how many samples they hold."""
     connection.execute(
         """UPDATE head SET (small_chunks, small_rows) =
@@ -196,11 +204,7 @@ def count_small(connection: sqlite3.Connection, twin: int) -> None:
     )
 
 
-def _matrix(blob: bytes, n_rows: int) -> NDArray[np.float64]:
-    return np.frombuffer(blob, dtype="<f8").reshape(n_rows, -1)
-
-
-def _around(connection: sqlite3.Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
     instants, n_rows = np.unique(batch.time_us), batch.values.shape[0]
     spans = np.array(
@@ -219,9 +223,9 @@ def _around(connection: sqlite3.Connection, twin: int, batch: Batch) -> tuple[ND
         if wanted.any():
             value = connection.execute("SELECT value FROM chunk WHERE id = ?", (chunk,)).fetchone()[0]
             times.append(time_us[wanted])
-            values.append(_matrix(value, n_rows)[:, wanted])
-    time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
-    return collapse(time_us, matrix) if time_us.size else (time_us, matrix)
+            values.append(matrix(value, n_rows, wanted.size)[:, wanted])
+    time_us, known = np.concatenate(times), np.concatenate(values, axis=1)
+    return collapse(time_us, known) if time_us.size else (time_us, known)
 
 
 def _found_in(stored: list[NDArray[np.int64]], instants: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
@@ -237,7 +241,7 @@ def _found_in(stored: list[NDArray[np.int64]], instants: NDArray[np.int64]) -> l
 
 
 def select(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     n_channels: int,
     rows: Sequence[int],
@@ -251,17 +255,18 @@ def select(
     times, values = [np.empty(0, dtype=np.int64)], [np.empty((len(chosen), 0))]
     query = "SELECT time, value FROM chunk WHERE twin = ? AND last_us >= ? AND first_us < ? ORDER BY first_us, id"
     for time, value in connection.execute(query, (twin, start, stop)):
-        time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)[chosen]
+        time_us = instants(time)
+        held = matrix(value, n_channels, time_us.size)[chosen]
         inside = (time_us >= start) & (time_us < stop)
         whole = bool(inside.all())
         times.append(time_us if whole else time_us[inside])
-        values.append(matrix if whole else matrix[:, inside])
-    time_us, matrix = np.concatenate(times), np.concatenate(values, axis=1)
-    return Samples(*collapse(time_us, matrix)) if time_us.size else Samples(time_us, matrix)
+        values.append(held if whole else held[:, inside])
+    time_us, found = np.concatenate(times), np.concatenate(values, axis=1)
+    return Samples(*collapse(time_us, found)) if time_us.size else Samples(time_us, found)
 
 
 def overview(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     n_channels: int,
     rows: Sequence[int],
@@ -286,20 +291,21 @@ def overview(
     times, values = [np.empty(0, dtype=np.int64)], [np.empty((len(chosen), 0))]
     left_out = 0
     for part in outline.parts(connection, "chunk", [span[:3] for span in spans], start, stop, n_channels):
-        time_us, matrix = part.time_us, part.values
-        if time_us is None or matrix is None:
+        time_us, held = part.time_us, part.values
+        if time_us is None or held is None:
             time, value = connection.execute("SELECT time, value FROM chunk WHERE id = ?", (part.chunk,)).fetchone()
-            time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)
+            time_us = instants(time)
+            held = matrix(value, n_channels, time_us.size)
         else:
             left_out += part.instants - time_us.size
         inside = (time_us >= start) & (time_us < stop)
         times.append(time_us[inside])
-        values.append(matrix[chosen][:, inside])
+        values.append(held[chosen][:, inside])
     found = Samples(*collapse(np.concatenate(times), np.concatenate(values, axis=1)))
     return found, int(found.time_us.size) + left_out
 
 
-def latest_seq(connection: sqlite3.Connection, twin: int) -> int:
+def latest_seq(connection: Connection, twin: int) -> int:
     """Return the last number of a twin's stream: every sample of a smaller one is in the archive."""
     row = connection.execute("SELECT seq FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
@@ -307,7 +313,7 @@ def latest_seq(connection: sqlite3.Connection, twin: int) -> int:
     return int(row[0])
 
 
-def revision(connection: sqlite3.Connection, twin: int) -> int:
+def revision(connection: Connection, twin: int) -> int:
     """Return how often stored samples of a twin were taken away."""
     row = connection.execute("SELECT revision FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
@@ -315,9 +321,7 @@ def revision(connection: sqlite3.Connection, twin: int) -> int:
     return int(row[0])
 
 
-def arrived(
-    connection: sqlite3.Connection, twin: int, after_seq: int, start_us: int, stop_us: int
-) -> NDArray[np.int64]:
+def arrived(connection: Connection, twin: int, after_seq: int, start_us: int, stop_us: int) -> NDArray[np.int64]:
     """Return the instants, start <= time < stop, of samples that came after one stream number, in any order."""
     found = [np.empty(0, dtype=np.int64)]
     query = "SELECT seq, time FROM chunk WHERE twin = ? AND last_seq > ? AND last_us >= ? AND first_us < ?"
@@ -327,9 +331,7 @@ def arrived(
     return np.concatenate(found)
 
 
-def since_seq(
-    connection: sqlite3.Connection, twin: int, n_channels: int, after_seq: int
-) -> tuple[NDArray[np.int64], Samples]:
+def since_seq(connection: Connection, twin: int, n_channels: int, after_seq: int) -> tuple[NDArray[np.int64], Samples]:
     """Return stream numbers and samples after one number, in the order of arrival."""
     seqs, times, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)], [np.empty((n_channels, 0))]
     query = "SELECT seq, time, value FROM chunk WHERE twin = ? AND last_seq > ?"
@@ -338,13 +340,13 @@ def since_seq(
         new = numbers > after_seq
         seqs.append(numbers[new])
         times.append(np.frombuffer(time, dtype="<i8")[new])
-        values.append(_matrix(value, n_channels)[:, new])
+        values.append(matrix(value, n_channels, new.size)[:, new])
     numbers = np.concatenate(seqs)
     order = np.argsort(numbers)
     return numbers[order], Samples(np.concatenate(times)[order], np.concatenate(values, axis=1)[:, order])
 
 
-def block_stop(connection: sqlite3.Connection, twin: int, start_us: int | None, n_rows: int) -> int | None:
+def block_stop(connection: Connection, twin: int, start_us: int | None, n_rows: int) -> int | None:
     """Return an instant before which about ``n_rows`` samples lie, counted from ``start_us``; None if fewer are left."""
     query = "SELECT last_us, n FROM chunk WHERE twin = ? AND last_us > ? ORDER BY last_us"
     total = 0
@@ -355,7 +357,7 @@ def block_stop(connection: sqlite3.Connection, twin: int, start_us: int | None, 
     return None
 
 
-def count_after(connection: sqlite3.Connection, twin: int, after_us: int | None) -> int:
+def count_after(connection: Connection, twin: int, after_us: int | None) -> int:
     """Return how many samples lie behind an instant; those that came in pieces count as often."""
     after = -(2**62) if after_us is None else after_us
     query = "SELECT coalesce(sum(n), 0) FROM chunk WHERE twin = ? AND last_us > ? AND first_us > ?"
@@ -366,7 +368,19 @@ def count_after(connection: sqlite3.Connection, twin: int, after_us: int | None)
     return count
 
 
-def newest(connection: sqlite3.Connection, twin: int, n_channels: int, count: int) -> Samples:
+def nth_newest_us(connection: Connection, twin: int, count: int) -> int | None:
+    """Return the instant from which on about ``count`` samples lie; None if there are no more than that."""
+    found = 0
+    query = "SELECT first_us, last_us, n FROM chunk WHERE twin = ? ORDER BY last_us DESC"
+    rows = iter(connection.execute(query, (twin,)))
+    for first_us, _, n in rows:
+        found += n
+        if found >= count:
+            return int(first_us) if next(rows, None) is not None else None
+    return None
+
+
+def newest(connection: Connection, twin: int, n_channels: int, count: int) -> Samples:
     """Return the last ``count`` samples of the archive, or all if there are fewer."""
     found, start_us = 0, -(2**62)
     query = "SELECT first_us, n FROM chunk WHERE twin = ? ORDER BY last_us DESC"
@@ -380,7 +394,7 @@ def newest(connection: sqlite3.Connection, twin: int, n_channels: int, count: in
     return Samples(held.time_us[-count:], held.values[:, -count:])
 
 
-def newest_first(connection: sqlite3.Connection, twin: int, n_channels: int, after_seq: int) -> Iterator[Batch]:
+def newest_first(connection: Connection, twin: int, n_channels: int, after_seq: int) -> Iterator[Batch]:
     """Yield the chunks with samples that came after a stream number, those that end latest first."""
     query = """SELECT time, value, received FROM chunk WHERE twin = ? AND last_seq > ? ORDER BY last_us DESC"""
     for blobs in connection.execute(query, (twin, after_seq)):
@@ -392,7 +406,7 @@ MOST_SEARCHED = 256
 
 
 def last_values(
-    connection: sqlite3.Connection, twin: int, n_channels: int, rows: Sequence[int], before_us: int
+    connection: Connection, twin: int, n_channels: int, rows: Sequence[int], before_us: int
 ) -> dict[int, float]:
     """Return the last value before an instant of each channel whose position ``rows`` names; absent where none is found."""
     found: dict[int, tuple[int, float]] = {}
@@ -401,10 +415,11 @@ def last_values(
     for last_us, time, value in connection.execute(query, (twin, before_us, MOST_SEARCHED)):
         if len(found) == len(rows) and last_us < min(instant for instant, _ in found.values()):
             break
-        time_us, matrix = np.frombuffer(time, dtype="<i8"), _matrix(value, n_channels)
+        time_us = instants(time)
+        held = matrix(value, n_channels, time_us.size)
         for row in rows:
-            at = np.flatnonzero((time_us < before_us) & np.isfinite(matrix[row]))
+            at = np.flatnonzero((time_us < before_us) & np.isfinite(held[row]))
             if at.size:
                 best = at[np.argmax(time_us[at])]
-                found[row] = max(found.get(row, (-(2**62), 0.0)), (int(time_us[best]), float(matrix[row, best])))
+                found[row] = max(found.get(row, (-(2**62), 0.0)), (int(time_us[best]), float(held[row, best])))
     return {row: value for row, (_, value) in found.items()}

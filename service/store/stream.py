@@ -1,13 +1,12 @@
 """The past of a stream: samples, residuals and events put back into the order of their numbers."""
 
-import sqlite3
-
 from service.messages import EventStretch, Json, ResidualStretch, SampleStretch, Stretch
 from service.store import events, residuals, samples
+from service.store.connection import Connection
 
 
 def since_seq(
-    connection: sqlite3.Connection,
+    connection: Connection,
     twin: int,
     channels: tuple[str, ...],
     sensors: tuple[str, ...],

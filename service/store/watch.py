@@ -1,9 +1,9 @@
 """What an alarm asks of each twin: when its last sample was taken, and what is open."""
 
-import sqlite3
 from dataclasses import dataclass
 
 from service.instants import now_us
+from service.store.connection import Connection
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Vitals:
     red: int
 
 
-def select(connection: sqlite3.Connection) -> list[Vitals]:
+def select(connection: Connection) -> list[Vitals]:
     """Return the vitals of every twin."""
     rows = connection.execute(
         """SELECT twin.name, head.last_us,

@@ -15,7 +15,7 @@ import pytest
 from service.client import ApiError, TwinClient, Unreachable
 from service.settings import read_settings
 from service.store.database import Database
-from service.store.lock import StoreError
+from service.store.errors import StoreError
 from tests.service.conftest import SPEC
 from tests.service.server import FAKE, Server
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service.errors import BadField
 from service.instants import format_instant, format_instants, parse_instant, parse_instants, parse_parameter
-from service.problems import BadField
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 moments = st.datetimes(datetime(1970, 1, 2), datetime(2199, 12, 30))

@@ -6,7 +6,8 @@ import httpx
 import orjson
 import pytest
 
-from service import frames, intake
+from service import intake
+from service.http import telemetry_body
 from service.store.database import Database
 from tests.service.harness import AppClient
 
@@ -60,7 +61,7 @@ def test_a_refused_request_harms_no_other(registered: AppClient) -> None:
 
 @pytest.mark.parametrize("form", ["json", "x-ndjson"])
 def test_a_short_body_of_very_many_missing_values_is_refused(registered: AppClient, monkeypatch, form: str) -> None:
-    monkeypatch.setattr(frames, "MOST_VALUES", 30)
+    monkeypatch.setattr(telemetry_body, "MOST_VALUES", 30)
     for n_times, status in ((10, 200), (11, 413)):
         columns = orjson.dumps({"time": [*range(n_times)], "values": {}})
         lines = b"\n".join(orjson.dumps({"time": k, "values": {}}) for k in range(n_times))

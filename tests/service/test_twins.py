@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from service.registry import Entry
-from service.store.gone import TwinGone
+from service.store.errors import TwinGone
 from tests.service.conftest import SPEC
 from tests.service.harness import AppClient
 

@@ -101,6 +101,16 @@ _UniqueKeys.yaml_implicit_resolvers = {
 }
 
 
+class _NoAliases(_UniqueKeys):
+    """The same without aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            line = self.peek_event().start_mark.line + 1
+            raise SpecError(f"line {line}: aliases are not taken here; write the part out")
+        return super().compose_node(parent, index)
+
+
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return a JSON object, refusing a key that stands twice."""
     result = dict(pairs)
@@ -123,27 +133,49 @@ def read_mapping(path: Path) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else "not a text file"
         raise SpecError(f"{path}: cannot be read ({reason})") from error
+    return parse_mapping(text, str(path), is_json=Path(path).suffix == ".json")
+
+
+def parse_mapping(text: str, name: str, *, is_json: bool = False, may_repeat: bool = True) -> dict[str, Any]:
+    """Read a YAML or JSON text whose top level is a mapping.
+
+    Parameters
+    ----------
+    text
+        What to read.
+    name
+        Of the text, at the head of every message.
+    is_json
+        Whether it is JSON; YAML otherwise.
+    may_repeat
+        Whether YAML may repeat parts of itself by aliases: a short text of a stranger might stand for a very long one.
+
+    Raises
+    ------
+    SpecError
+        If it is not YAML or JSON, or is not a mapping.
+    """
     try:
-        if Path(path).suffix == ".json":
+        if is_json:
             data = json.loads(text, object_pairs_hook=_unique)
         else:
-            data = yaml.load(text, Loader=_UniqueKeys)
+            data = yaml.load(text, Loader=_UniqueKeys if may_repeat else _NoAliases)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f"line {mark.line + 1}: " if mark else ""
         raise SpecError(
-            f"{path}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})"
+            f"{name}: {line}not valid YAML ({getattr(error, 'problem', None) or 'cannot be parsed'})"
         ) from error
     except json.JSONDecodeError as error:
-        raise SpecError(f"{path}: line {error.lineno}: not valid JSON ({error.msg})") from error
+        raise SpecError(f"{name}: line {error.lineno}: not valid JSON ({error.msg})") from error
     except RecursionError as error:
-        raise SpecError(f"{path}: is nested too deeply") from error
+        raise SpecError(f"{name}: is nested too deeply") from error
     except SpecError as error:
-        raise SpecError(f"{path}: {error}") from error
+        raise SpecError(f"{name}: {error}") from error
     except ValueError as error:
-        raise SpecError(f"{path}: holds a number of too many digits") from error
+        raise SpecError(f"{name}: holds a number of too many digits") from error
     if not isinstance(data, dict):
-        raise SpecError(f"{path}: the top level must be a mapping of fields, got {type(data).__name__}")
+        raise SpecError(f"{name}: the top level must be a mapping of fields, got {type(data).__name__}")
     return data
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from service.store import migrations
 from service.store.database import Database
-from service.store.lock import StoreError
+from service.store.errors import StoreError
 
 
 @pytest.fixture

@@ -4,11 +4,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Path
 
-from service.deps import NamedTwin, Running, operates, reads
 from service.fit import refuse_foreign
+from service.http.deps import NamedTwin, Running, operates, reads
 from service.jobs import outcome
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
-from service.store import models
+from service.store import models, retention
 from twin_core import __version__
 from twin_core.network.spec_io import load_spec
 
@@ -45,6 +45,13 @@ async def activate(service: Running, twin: NamedTwin, version: Version) -> Model
     row = await service.hub.write(twin.key, outcome.activate, twin.key, version, "requested")
     service.live.model_changed(twin.key)
     return ModelInfo(**row.wire())
+
+
+@router.delete("/{version}", status_code=204, dependencies=[operates])
+async def delete(service: Running, twin: NamedTwin, version: Version) -> None:
+    """Delete a version that is not active, with its residuals and anomalies."""
+    await service.database.write(retention.delete_model, twin.key, version)
+    service.housekeeping.wake()
 
 
 @router.post("", status_code=201, dependencies=[operates])

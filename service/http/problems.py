@@ -1,6 +1,7 @@
 """Errors on the wire: ``application/problem+json`` (RFC 9457), for everything that can go wrong."""
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from http import HTTPMethod, HTTPStatus
 from typing import Any
@@ -13,33 +14,37 @@ from starlette.responses import Response
 from starlette.routing import Match, Mount
 from starlette.types import Receive, Scope, Send
 
-from service.store.gone import TwinGone
+from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, Refusal, short
+from service.store.errors import Conflicting, DiskFull, Missing, TwinGone
 from twin_core.errors import TwinError
 
+_LONG = re.compile(rf"[^\s']{{{LONGEST_NAME + 1},}}")
+MOST_ERRORS = 20
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("service")
 
 _UNREADABLE = "There was an error parsing the body"
 """What FastAPI says of a body that its parser cannot cope with, such as one that is nested too deeply."""
 
-FieldErrors = Sequence[tuple[str, str]]
 
-
-class Problem(Exception):
-    """A request that is answered with a problem document."""
+class Problem(Refusal):
+    """A request that is answered with a problem document of one status."""
 
     def __init__(self, status: int, detail: str, errors: FieldErrors = ()) -> None:
         """Remember the status, one clear line and the fields to blame as (field, what is wrong)."""
-        super().__init__(detail)
-        self.status, self.detail, self.errors = status, detail, errors
+        super().__init__(detail, errors)
+        self.status = status
 
 
-class BadField(Problem):
-    """One field of a request is wrong (422)."""
+STATUS: Mapping[type[Refusal], int] = {BadField: 422, Missing: 404, Conflicting: 409, DiskFull: 507}
+"""What each refusal is in HTTP."""
 
-    def __init__(self, field: str, reason: str, status: int = 422) -> None:
-        """Name the field as the caller wrote it."""
-        super().__init__(status, f"{field}: {reason}", [(field, reason)])
+
+def status_of(error: Refusal) -> int:
+    """Return the status that a refusal is answered with."""
+    if isinstance(error, Problem):
+        return error.status
+    return next((status for kind, status in STATUS.items() if isinstance(error, kind)), 409)
 
 
 def document(status: int, detail: str, errors: FieldErrors = ()) -> bytes:
@@ -48,11 +53,16 @@ def document(status: int, detail: str, errors: FieldErrors = ()) -> bytes:
         "type": "about:blank",
         "title": HTTPStatus(status).phrase,
         "status": status,
-        "detail": detail,
+        "detail": _told(detail),
     }
     if errors:
-        content["errors"] = [{"field": field, "detail": reason} for field, reason in errors]
+        content["errors"] = [{"field": short(field), "detail": _told(reason)} for field, reason in errors[:MOST_ERRORS]]
     return orjson.dumps(content)
+
+
+def _told(line: str) -> str:
+    """Return a line in which no name is repeated at length."""
+    return short(_LONG.sub(lambda found: short(found[0]), line[: 10 * LONGEST_LINE]), LONGEST_LINE)
 
 
 def problem(status: int, detail: str, errors: FieldErrors = (), headers: Mapping[str, str] | None = None) -> Response:
@@ -71,20 +81,24 @@ def install(app: FastAPI) -> None:
     app.router.default = _nothing_there
 
 
-TOLD = (Problem, TwinError, TwinGone)
+TOLD = (Refusal, TwinError, TwinGone)
 """Errors that say what the caller did wrong, or what became of what it asked for."""
 
 
 def answer(error: Exception) -> Response:
     """Return the response for one of these errors."""
-    if isinstance(error, Problem):
-        return problem(error.status, error.detail, error.errors)
+    if isinstance(error, Refusal):
+        return problem(status_of(error), error.detail, error.errors)
     if isinstance(error, TwinGone):
         return problem(404, "the twin was deleted meanwhile")
+    assert isinstance(error, TwinError)
+    return problem(422, str(error), fields_of(error))
+
+
+def fields_of(error: TwinError) -> FieldErrors:
+    """Return the fields that an error of the core names."""
     told = [line.partition(": ") for line in getattr(error, "problems", (str(error),))]
-    return problem(
-        422, str(error), [(field, reason) for field, separator, reason in told if separator and " " not in field]
-    )
+    return [(field, reason) for field, separator, reason in told if separator and " " not in field]
 
 
 async def _nothing_there(scope: Scope, receive: Receive, send: Send) -> None:

@@ -7,7 +7,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service import problems
+from service.http import problems
 
 Endpoint = Callable[[Request, str], Awaitable[Response]]
 

@@ -4,7 +4,6 @@ import contextlib
 import json
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import Any, NoReturn, TypeVar
@@ -13,42 +12,13 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from service.instants import Instants, parse_instants
-from service.problems import BadField, Problem
+from service.errors import BadField, short
+from service.http.problems import Problem
+from service.instants import parse_instants
+from service.store.batch import MOST_VALUES, Batch
 
 T = TypeVar("T")
 
-
-@dataclass(frozen=True)
-class Batch:
-    """Samples in the order of their arrival.
-
-    Attributes
-    ----------
-    time_us : (n_times,)
-        Microseconds since 1970.
-    values : (n_channels, n_times)
-        In the channels' own units, rows in the order of the twin's channels; NaN is a missing sample.
-    received_us
-        When each arrived, (n_times,) microseconds since 1970 of this machine's clock; None where nobody noted it.
-    """
-
-    time_us: Instants
-    values: NDArray[np.float64]
-    received_us: Instants | None = None
-
-    @property
-    def received(self) -> Instants:
-        """When each sample arrived, (n_times,); 0 where nobody noted it."""
-        return np.zeros_like(self.time_us) if self.received_us is None else self.received_us
-
-    def take(self, keep: NDArray[np.bool_]) -> "Batch":
-        """Return the samples that a mask selects."""
-        return Batch(self.time_us[keep], self.values[:, keep], self.received[keep])
-
-
-MOST_VALUES = 2**24
-"""Of one batch, missing ones included: a short body may stand for very many of them. 16 MiB of numbers are always fewer."""
 
 Units = Mapping[str, str | None]
 """Channel -> unit, in the order of the rows."""
@@ -239,7 +209,7 @@ def _members(
 
 def _position(known: Mapping[str, T], name: str, field: str) -> T:
     if name not in known:
-        raise BadField(field, f"unknown channel '{name}' (known: {', '.join(known)})")
+        raise BadField(field, f"unknown channel '{short(name)}' (known: {', '.join(known)})")
     return known[name]
 
 

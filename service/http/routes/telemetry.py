@@ -7,15 +7,17 @@ from typing import Annotated, Any
 import numpy as np
 import orjson
 from fastapi import APIRouter, Path, Query, Request, Response
+from starlette.responses import StreamingResponse
 from starlette.routing import Route
 
-from service import archive_changes
-from service.access import Role
-from service.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
+from service import archive_changes, export
 from service.downsample import extremes
-from service.frames import parse_columns, parse_frames
+from service.errors import BadField, short
+from service.http.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
+from service.http.keys import Role
+from service.http.problems import Problem
+from service.http.telemetry_body import parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_instant, parse_parameter
-from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import Archive, Deletion, DeletionList, IngestReport, Interval, Posted, Quarantine
 from service.store import aside, samples
@@ -32,8 +34,17 @@ PARSE_APART_BYTES = 512 * 1024
 """Larger bodies are parsed in a thread, so that other requests are answered meanwhile."""
 MOST_POINTS = 200_000
 MOST_SHOWN = 1000
+USUAL_VALUES = 200_000
+"""In an answer to which nobody set a bound: a few megabytes."""
 AHEAD = "ahead of the receive clock"
 """Why a sample is in quarantine."""
+
+Points = Annotated[
+    int | None,
+    Query(
+        ge=2, le=MOST_POINTS, description="Most samples in the answer; absent: so many that it holds 200,000 values."
+    ),
+]
 
 _FRAME = {"type": "string", "description": 'One {"time": ..., "values": {...}} per line.'}
 _BODY = {
@@ -96,10 +107,11 @@ async def archive(
     start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
     stop: Annotated[str | None, Query(description="First instant after the last one wanted.")] = None,
     channels: Annotated[str | None, Query(description="Channels separated by commas; absent: all.")] = None,
-    max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
+    max_points: Points = None,
 ) -> Response:
     """Return start <= time < stop as columns; beyond ``max_points`` only samples that hold extremes."""
     names = _named(channels, twin)
+    max_points = bounded(max_points, len(names))
     start_us, stop_us = span(start, stop)
     rows = [twin.channels.index(name) for name in names]
     found, count = await service.database.read(
@@ -107,6 +119,21 @@ async def archive(
     )
     document = await asyncio.to_thread(_render, found, count, names, twin, max_points)
     return Response(document, media_type="application/json")
+
+
+@router.get("/export", dependencies=[reads], response_class=StreamingResponse)
+async def export_file(
+    service: Running,
+    twin: NamedTwin,
+    format: Annotated[export.Format, Query(description="csv or parquet.")] = "csv",
+    start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
+    stop: Annotated[str | None, Query(description="First instant after the last one wanted.")] = None,
+    channels: Annotated[str | None, Query(description="Channels separated by commas; absent: all.")] = None,
+) -> StreamingResponse:
+    """Return every sample of start <= time < stop as a file, however long it gets."""
+    pieces = export.stream(service.database, twin, _named(channels, twin), *span(start, stop), format)
+    headers = {"Content-Disposition": f'attachment; filename="{twin.name}.{format}"'}
+    return StreamingResponse(pieces, media_type=export.MEDIA[format], headers=headers)
 
 
 @router.delete("", dependencies=[operates])
@@ -185,6 +212,11 @@ async def discard(
     return Deletion(**made.wire())
 
 
+def bounded(max_points: int | None, n_columns: int) -> int:
+    """Return how many samples an answer of so many columns holds at most."""
+    return max_points or max(2, USUAL_VALUES // max(n_columns, 1))
+
+
 def span(start: str | None, stop: str | None) -> tuple[int | None, int | None]:
     """Return the instants of an interval in microseconds; BadField if it is empty."""
     start_us = None if start is None else parse_parameter(start, "start")
@@ -200,7 +232,7 @@ def _named(channels: str | None, twin: Entry) -> list[str]:
     names = list(dict.fromkeys(name.strip() for name in channels.split(",")))
     for name in names:
         if name not in twin.channels:
-            raise BadField("channels", f"unknown channel '{name}' (known: {', '.join(twin.channels)})")
+            raise BadField("channels", f"unknown channel '{short(name)}' (known: {', '.join(twin.channels)})")
     return names
 
 

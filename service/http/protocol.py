@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from service.problems import MEDIA_TYPE, document
+from service.http.problems import MEDIA_TYPE, document
 
 MOST_HEAD_BYTES = 64 * 1024
 

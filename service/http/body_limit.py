@@ -5,7 +5,8 @@ import zlib
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.problems import BadField, Problem, problem
+from service.errors import Refusal
+from service.http.problems import Problem, problem, status_of
 
 LEAST_RATE_BYTES_PER_S = 32 * 1024
 DECODE_APART_BYTES = 64 * 1024
@@ -33,8 +34,8 @@ class Bodies:
             encoding = headers.get(b"content-encoding", b"identity").lower()
             if encoding not in (b"", b"identity"):
                 body = await _decode(body, encoding, self._max_bytes)
-        except Problem as error:
-            await problem(error.status, error.detail, error.errors, headers={"Connection": "close"})(
+        except Refusal as error:
+            await problem(status_of(error), error.detail, error.errors, headers={"Connection": "close"})(
                 scope, receive, send
             )
             return
@@ -126,11 +127,13 @@ def _gunzip(body: bytes, max_bytes: int) -> bytes:
         while not decoder.eof:
             piece = rest[:PIECE_BYTES]  # what lies behind the end of a member is copied: let that be little
             if not piece:
-                raise BadField("body", "is not one complete gzip stream", 400)
+                raise Problem(
+                    400, "body: is not one complete gzip stream", [("body", "is not one complete gzip stream")]
+                )
             try:
                 parts.append(decoder.decompress(piece, max_bytes + 1 - size))
             except zlib.error:
-                raise BadField("body", "is not valid gzip", 400) from None
+                raise Problem(400, "body: is not valid gzip", [("body", "is not valid gzip")]) from None
             size += len(parts[-1])
             if size > max_bytes:
                 raise Problem(

@@ -1,45 +1,17 @@
-"""Who may do what: API keys, their roles, and the gate in front of every route."""
+"""Who may do what: the gate in front of every route."""
 
-import hmac
 import ipaddress
-from enum import IntEnum
 from functools import lru_cache
 from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.problems import problem
+from service.http.keys import Key, Keys, Role
+from service.http.problems import problem
 
 OPEN_PATHS = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json", "/favicon.ico"})
 OPEN_PREFIXES = ("/assets/", "/docs/")
 SUBPROTOCOL = "bearer."
-
-
-class Role(IntEnum):
-    """What a key allows; each role includes the ones before it."""
-
-    read = 1
-    ingest = 2
-    operate = 3
-
-
-def parse_keys(text: str) -> dict[str, Role]:
-    """Return key -> role from ``role:key`` pairs separated by commas.
-
-    Raises
-    ------
-    ValueError
-        Naming the position of a malformed pair, never the key.
-    """
-    keys: dict[str, Role] = {}
-    for position, pair in enumerate(filter(None, (part.strip() for part in text.split(","))), start=1):
-        role, separator, key = pair.partition(":")
-        if not separator or role not in Role.__members__ or not key:
-            raise ValueError(f"pair {position} must read role:key with role read, ingest or operate")
-        if key in keys:
-            raise ValueError(f"pair {position} repeats the key of an earlier pair")
-        keys[key] = Role[role]
-    return keys
 
 
 class Gate:
@@ -49,10 +21,9 @@ class Gate:
     served, and no foreign web page may speak through a browser that runs here (403).
     """
 
-    def __init__(self, app: ASGIApp, keys: dict[str, Role]) -> None:
-        """Keep the keys as bytes, compared in constant time."""
-        self._app = app
-        self._keys = [(key.encode(), role) for key, role in keys.items()]
+    def __init__(self, app: ASGIApp, keys: Keys) -> None:
+        """Ask for these keys, if there are any."""
+        self._app, self._keys = app, keys
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on with ``scope['state']['role']`` set, or refuse it."""
@@ -60,41 +31,44 @@ class Gate:
             await self._app(scope, receive, send)
             return
         headers = {name: value for name, value in scope["headers"] if name in _HEADERS}
-        role = self._role(headers) if self._keys else Role.operate
-        refusal = self._refusal(scope, headers, role)
+        key = self._keys.find(sent) if self._keys.needed and (sent := _sent(headers)) else None
+        refusal = self._refusal(scope, headers, key)
+        state = scope.setdefault("state", {})
+        if key is not None or not self._keys.needed:
+            state["who"] = "this machine" if key is None else key.name
         if refusal is None:
-            scope.setdefault("state", {})["role"] = role
+            state["role"] = Role.operate if not self._keys.needed else None if key is None else key.role
             await self._app(scope, receive, send)
         else:
             status, detail = refusal
             extra = {"WWW-Authenticate": "Bearer"} if status == 401 else None
             await problem(status, detail, headers=extra)(scope, receive, send)
 
-    def _role(self, headers: dict[bytes, bytes]) -> Role | None:
-        given = headers.get(b"authorization", b"")
-        scheme, _, key = given.partition(b" ")
-        if scheme.lower() != b"bearer":
-            protocols = headers.get(b"sec-websocket-protocol", b"").split(b",")
-            marked = [p.strip() for p in protocols if p.strip().startswith(SUBPROTOCOL.encode())]
-            key = marked[0].removeprefix(SUBPROTOCOL.encode()) if marked else b""
-        found = [role for known, role in self._keys if hmac.compare_digest(known, key.strip())]
-        return found[0] if found else None
-
-    def _refusal(self, scope: Scope, headers: dict[bytes, bytes], role: Role | None) -> tuple[int, str] | None:
+    def _refusal(self, scope: Scope, headers: dict[bytes, bytes], key: Key | None) -> tuple[int, str] | None:
         path = scope["path"]
         if path in OPEN_PATHS or path.startswith(OPEN_PREFIXES):
             return None
-        if role is None:
+        if self._keys.needed and key is None:
             return 401, "a valid API key is needed: send 'Authorization: Bearer KEY'"
-        if not self._keys and not _is_local(scope.get("client")):
+        if not self._keys.needed and not _is_local(scope.get("client")):
             return 403, "this service has no API keys, so it answers callers on its own machine only"
         host = headers.get(b"host", b"").decode("latin-1")
-        if not self._keys and not _names_this_machine(host):
+        if not self._keys.needed and not _names_this_machine(host):
             return 403, "this service has no API keys, so it answers to local names only, such as localhost"
         origin = headers.get(b"origin")
-        if origin is not None and not self._keys and _netloc(origin) != host:
+        if origin is not None and not self._keys.needed and _netloc(origin) != host:
             return 403, "requests from other web sites are refused"
         return None
+
+
+def _sent(headers: dict[bytes, bytes]) -> bytes:
+    """Return the key that a request brings along, empty where it has none."""
+    scheme, _, key = headers.get(b"authorization", b"").partition(b" ")
+    if scheme.lower() != b"bearer":
+        protocols = headers.get(b"sec-websocket-protocol", b"").split(b",")
+        marked = [p.strip() for p in protocols if p.strip().startswith(SUBPROTOCOL.encode())]
+        key = marked[0].removeprefix(SUBPROTOCOL.encode()) if marked else b""
+    return key.strip()
 
 
 _HEADERS = frozenset({b"authorization", b"sec-websocket-protocol", b"origin", b"host"})

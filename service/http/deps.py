@@ -6,25 +6,30 @@ All of them are coroutines, although none waits: a plain function would be run i
 import asyncio
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import Depends, Path
 from fastapi.dependencies.models import Dependant
 from starlette.requests import HTTPConnection
 
-from service.access import Role
+from service.errors import short
+from service.housekeeping import Housekeeping
+from service.http.keys import Role
+from service.http.problems import Problem
+from service.http.specification_body import Specified
 from service.intake import Intake
+from service.jobs import outcome
 from service.jobs.runner import Jobs
 from service.live.live import Live
 from service.metrics import Metrics
-from service.problems import Problem
 from service.registry import Entry, Registry
 from service.settings import Settings
-from service.store import twins
+from service.store import retention, twins
 from service.store.database import Database
-from service.store.gone import TwinGone
+from service.store.errors import TwinGone
 from service.store.twins import Twin
 from service.streams import Hub
+from twin_core.network.spec import TwinSpec
 
 
 @dataclass
@@ -39,23 +44,45 @@ class Service:
     live: Live
     intake: Intake
     jobs: Jobs
+    housekeeping: Housekeeping
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    def add_twin(self, twin: Twin) -> Entry:
-        """Let a stored twin take part in everything."""
+    def add_twin(self, twin: Twin, spec: TwinSpec | None = None) -> Entry:
+        """Let a stored twin take part in everything; its specification need not be checked again where it just was."""
         entry = self.registry.add(twin)
+        if spec is not None:
+            entry.know(spec)
         self.hub.open(entry.key, twin.seq)
         if self.settings.assimilate:
             self.live.add(entry)
         self.live.arrived(entry)  # what the archive holds and nobody has looked at
         return entry
 
-    async def register(self, name: str, specification: dict[str, Any]) -> tuple[Twin, bool]:
+    async def register(self, given: Specified) -> tuple[Twin, bool]:
         """Return the twin, and whether it is new; never between the steps of a deletion."""
         async with self._coming_and_going:
-            twin, is_new = await self.database.write(twins.register, name, specification)
-            self.add_twin(twin)
+            twin, is_new = await self.database.write(twins.register, given.spec.twin, given.data)
+            self.add_twin(twin, given.spec if is_new else None)
             return twin, is_new
+
+    async def revise(self, twin: Entry, given: Specified) -> tuple[Twin, bool]:
+        """Give a twin another specification; return it, and whether anything changed. Streams end and resume."""
+        async with self._coming_and_going:
+            if self.registry.get(twin.name) is not twin:
+                raise TwinGone(f"twin {twin.key} is gone")
+            made, is_new = await self.database.write(twins.revise, twin.name, given.data)
+            if is_new:
+                await self.live.remove(twin)
+                self.hub.close(twin.key)
+                entry = self.registry.replace(made)
+                entry.know(given.spec)
+                left = int(entry.sensors != twin.sensors)
+                while left:
+                    left = await self.database.write(retention.forget_derived, twin.key)
+                self.add_twin(made)
+                news = [("twin", {"revision": made.revision})]
+                await self.hub.write(twin.key, outcome.tell, twin.key, news)
+            return made, is_new
 
     async def remove_twin(self, twin: Entry) -> None:
         """Stop whatever concerns a twin, then delete it; Problem 404 if somebody else just did."""
@@ -67,6 +94,7 @@ class Service:
             await self.live.remove(twin)
             await self.database.write(twins.delete, twin.name)
             self.hub.close(twin.key)
+            self.housekeeping.wake()
 
 
 async def running_service(connection: HTTPConnection) -> Service:
@@ -106,7 +134,7 @@ def refuse_unknown(connection: HTTPConnection, known: Collection[str] = ()) -> N
         errors = [(name, "unknown parameter") for name in connection.query_params if name not in known]
         if errors:
             expected = f"known: {', '.join(known)}" if known else "there are none"
-            raise Problem(422, f"{errors[0][0]}: unknown parameter ({expected})", errors)
+            raise Problem(422, f"{short(errors[0][0])}: unknown parameter ({expected})", errors)
 
 
 async def known_parameters(connection: HTTPConnection) -> None:

@@ -7,12 +7,13 @@ import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Response
 
-from service.deps import NamedTwin, Running, Service, reads
 from service.downsample import extremes
+from service.fit import lacks
+from service.http.deps import NamedTwin, Running, Service, reads
+from service.http.routes.telemetry import Points, bounded, span
 from service.instants import format_instant, format_instants
 from service.live import forecasts, limits, screening
 from service.registry import Entry
-from service.routes.telemetry import MOST_POINTS, span
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Inputs, Network, Residuals
 from service.store import anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
@@ -50,6 +51,11 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     expected = list(limits.expected(twin, look.position.time_us, look.made))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    if missing := lacks(look.active.specification, twin.specification):
+        what = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
+        document["notices"].append(
+            f"model version {look.active.version} was made for another revision of the specification: {what}; recalibrate"
+        )
     return Response(orjson.dumps(document), media_type="application/json")
 
 
@@ -69,10 +75,11 @@ async def list_residuals(
     start: Start = None,
     stop: Stop = None,
     version: Version = None,
-    max_points: Annotated[int, Query(ge=2, le=MOST_POINTS, description="Most samples in the answer.")] = MOST_POINTS,
+    max_points: Points = None,
 ) -> Response:
     """Return innovations, their predicted standard deviations and the NIS, and which samples are no readings, and why."""
     start_us, stop_us = span(start, stop)
+    max_points = bounded(max_points, 2 * len(twin.sensors) + 1)
     if version is not None:
         await service.database.read(models.get, twin.key, version)
     tracker = service.live.tracker(twin)

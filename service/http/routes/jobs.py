@@ -7,10 +7,11 @@ from typing import Any
 from fastapi import APIRouter, Response
 from starlette.responses import HTMLResponse
 
-from service.deps import NamedTwin, Running, Service, operates, reads
+from service.errors import BadField, short
+from service.http.deps import NamedTwin, Running, Service, operates, reads
+from service.http.problems import Problem
 from service.instants import format_instant, parse_instant
 from service.jobs.runner import LEAST_SAMPLES
-from service.problems import BadField, Problem
 from service.registry import Entry
 from service.schemas import CalibrationRequest, DiagnosisRequest, Job, JobKind, JobList
 from service.store import jobs, twins
@@ -69,7 +70,7 @@ async def _check_method(method: str) -> None:
         return
     module = await asyncio.to_thread(importlib.import_module, "twin_core.calibrate")
     if method not in module.METHODS:
-        raise BadField("method", f"unknown method '{method}' (known: {', '.join(module.METHODS)})")
+        raise BadField("method", f"unknown method '{short(method)}' (known: {', '.join(module.METHODS)})")
 
 
 @calibrations.post("", status_code=202, dependencies=[operates])

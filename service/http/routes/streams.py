@@ -9,10 +9,10 @@ import orjson
 from fastapi import APIRouter, Header, Query, WebSocket, WebSocketDisconnect
 from starlette.responses import StreamingResponse
 
-from service.access import SUBPROTOCOL
-from service.deps import NamedTwin, Running, reads
+from service.errors import BadField
+from service.http.auth import SUBPROTOCOL
+from service.http.deps import NamedTwin, Running, reads
 from service.messages import Json
-from service.problems import BadField
 from service.registry import Entry
 from service.streams import Hub
 

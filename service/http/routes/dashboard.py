@@ -11,7 +11,7 @@ from starlette.types import Receive, Scope, Send
 
 import twin_core
 
-ROOM = Path(__file__).parent.parent / "dashboard"
+ROOM = Path(__file__).parents[2] / "dashboard"
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; script-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"

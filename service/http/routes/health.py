@@ -2,7 +2,7 @@
 
 from fastapi import APIRouter, Response
 
-from service.deps import Running, reads
+from service.http.deps import Running, reads
 from service.metrics import CONTENT_TYPE
 from service.store import twins, watch
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 
-from service.deps import NamedTwin, Running, operates, reads
+from service.http.deps import NamedTwin, Running, operates, reads
 from service.instants import now_us
 from service.schemas import AcknowledgeRequest, Alarm, AlarmList, ShelveRequest
 from service.store import alarms

@@ -1,0 +1,80 @@
+"""``twin backup``, ``twin restore`` and ``twin migrate``: whole copies of the service's database."""
+
+from pathlib import Path
+
+import click
+
+from replay.cli.command import FILE, Command
+
+DATABASE = click.option("--database", type=FILE, help="The service's file.  [default: as TWIN_DATABASE_URL says]")
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the outcome as JSON.")
+
+
+@click.command(
+    cls=Command, short_help="Copy the service's database while it runs.", example="twin backup twin-copy.sqlite3"
+)
+@click.argument("file", type=FILE)
+@DATABASE
+@AS_JSON
+def backup(file: Path, database: Path | None, as_json: bool) -> None:
+    """Write a consistent copy of the service's database to FILE, also while it serves, and check it by reading all of it."""
+    from service.store.copies import backup as copy
+
+    contents = copy(_file(database), file)
+    _say({"file": str(file), **vars(contents)}, f"{file}: {contents.words}, checked", as_json)
+
+
+@click.command(cls=Command, short_help="Put a backup in place.", example="twin restore twin-copy.sqlite3")
+@click.argument("file", type=FILE)
+@DATABASE
+@AS_JSON
+def restore(file: Path, database: Path | None, as_json: bool) -> None:
+    """Check the backup FILE and put it in the place of the service's database; the service must not run.
+
+    The former database stays beside it under another name.
+    """
+    from service.store.copies import restore as put
+
+    target = _file(database)
+    contents, former = put(file, target)
+    kept = f"; the former one is {former}" if former else ""
+    outcome = {"file": str(target), "former": None if former is None else str(former), **vars(contents)}
+    _say(outcome, f"{target}: {contents.words}, checked{kept}", as_json)
+
+
+@click.command(cls=Command, short_help="Bring the database up to date.", example="twin migrate --rehearse")
+@click.option("--rehearse", is_flag=True, help="Try it on a copy and leave the database as it is.")
+@DATABASE
+@AS_JSON
+def migrate(rehearse: bool, database: Path | None, as_json: bool) -> None:
+    """Apply the schema steps that the service would apply at its start; --rehearse tries them on a copy, also while it serves."""
+    import tempfile
+
+    from service.store import copies
+    from service.store.database import Database
+
+    path = _file(database)
+    folder = path.resolve().parent
+    with tempfile.TemporaryDirectory(prefix="twin-", dir=folder) as name:  # where there is room for a copy
+        made = copies.rehearse(path, Path(name))
+    if not rehearse:
+        Database(path).close()
+    words = ", ".join(made.steps) if made.steps else "nothing to do"
+    tried = " (on a copy)" if rehearse else ""
+    _say(
+        {"steps": list(made.steps), "elapsed_s": made.elapsed_s, "rehearsed": rehearse},
+        f"{path}: {words}{tried}, {made.elapsed_s:.1f} s; {made.after.words}, checked",
+        as_json,
+    )
+
+
+def _file(database: Path | None) -> Path:
+    from service.settings import read_settings
+
+    return database or read_settings(host="127.0.0.1").database_path
+
+
+def _say(outcome: dict[str, object], line: str, as_json: bool) -> None:
+    from replay.cli.console import print_line, to_json
+
+    print_line(to_json(outcome).rstrip() if as_json else line)

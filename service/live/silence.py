@@ -1,0 +1,65 @@
+"""Sensors that fall silent, and speak again, are told once: to the stream, and by it to webhooks."""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Sequence
+
+from service.instants import in_words, now_us
+from service.jobs import outcome
+from service.live.live import Live
+from service.registry import Entry, Registry
+from service.store.errors import TwinGone
+from service.streams import Hub
+
+log = logging.getLogger("service.live")
+
+LOOK_EVERY_S = 10.0
+
+
+class Silence:
+    """Looks at every twin now and then; after a start it tells of what is silent then."""
+
+    def __init__(self, registry: Registry, live: Live, hub: Hub) -> None:
+        """Begin at once."""
+        self._registry, self._live, self._hub = registry, live, hub
+        self._silent: dict[int, frozenset[str]] = {}
+        self._task = asyncio.create_task(self._run())
+
+    async def close(self) -> None:
+        """Stop."""
+        self._task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await self._task
+
+    async def _run(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_EVERY_S)
+            for twin in self._registry:
+                try:
+                    await self.look(twin)
+                except TwinGone:
+                    self._silent.pop(twin.key, None)
+                except Exception:
+                    log.exception("nobody can tell which sensors are silent", extra={"twin": twin.name})
+
+    async def look(self, twin: Entry) -> None:
+        """Tell which sensors of a twin fell silent since the last look, and which ones are heard again."""
+        beats, at_us = await self._live.beats(twin), now_us()
+        silent = frozenset(name for name in twin.sensors if beats[name].standing(at_us) == "stale")
+        before = self._silent.get(twin.key, frozenset())
+        self._silent[twin.key] = silent
+        messages = []
+        if fallen := sorted(silent - before):
+            ages = [age for name in fallen if (age := beats[name].silent_s(at_us)) is not None]
+            since = f" for {in_words(max(ages))}" if ages else ""
+            text = f"no telemetry of {_listed(fallen)}{since}"
+            messages.append(("stale", {"state": "stale", "channels": fallen, "text": text}))
+        if back := sorted(before - silent):
+            messages.append(("stale", {"state": "live", "channels": back, "text": f"{_listed(back)} reports again"}))
+        if messages:
+            await self._hub.write(twin.key, outcome.tell, twin.key, messages)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -1,0 +1,242 @@
+"""What a twin needs that is kept for years: windows, bounds, exports, retention, deletion in pieces."""
+
+import io
+import sqlite3
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from service.jobs.executor import JobFailed, ProcessPerTask
+from service.store import retention, samples, selection
+from service.store.batch import Batch
+from service.store.database import Database
+from tests.service.conftest import SPEC
+from tests.service.fakes import FakeWorkbench
+from tests.service.harness import AppClient
+from tests.service.test_jobs import finish
+
+TWIN = "/v1/twins/benchsat"
+N = 3000
+
+
+def ingest(client: AppClient, first: int, count: int, power: float = 0.5) -> None:
+    times = [float(k) for k in range(first, first + count)]
+    values = {
+        "T_px": [290.0 + 0.001 * k for k in range(first, first + count)],
+        "T_tank": [15.0 + k % 7 for k in range(first, first + count)],
+        "Q_px": [power] * count,
+    }
+    assert client.post(f"{TWIN}/telemetry", json={"time": times, "values": values}).json()["accepted"] == count
+
+
+def calibrate(client: AppClient, body: dict[str, Any]) -> Any:
+    return finish(client, client.post(f"{TWIN}/calibrations", json=body).headers["Location"])
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Any:
+    database = Database(tmp_path / "store.sqlite3")
+    database.submit(
+        lambda c: c.execute("INSERT INTO twin (name, specification, created_us) VALUES ('t', '{}', 0)")
+    ).result()
+    database.submit(lambda c: c.execute("INSERT INTO head (twin) VALUES (1)")).result()
+    yield database
+    database.close()
+
+
+def test_a_thinned_archive_keeps_readings_and_loses_no_heat(database: Database) -> None:
+    generator = np.random.default_rng(0)
+    time_us = np.cumsum(generator.integers(1, 5, 4000)) * 1_000_000
+    values = np.stack([generator.normal(290, 1, 4000), generator.choice([0.0, 50.0], 4000)])
+    values[1, generator.random(4000) < 0.3] = np.nan  # an input that is sent when it changes
+    values[1, 0] = 20.0
+    for first in range(0, 4000, 500):
+        database.submit(samples.append, 1, Batch(time_us[first : first + 500], values[:, first : first + 500])).result()
+    made = database.submit(selection.choose, 1, 2, None, None, 400, True, [0], [1]).result()
+    kept = made.samples
+    assert (made.how, made.stride, made.of, kept.time_us.size) == ("thinned", 10, 4000, 400)
+    place = np.searchsorted(time_us, kept.time_us)
+    assert (kept.values[0] == values[0, place]).all()
+    held = pd.Series(values[1]).ffill().to_numpy()
+    joules = (held[:-1] * np.diff(time_us)).cumsum()
+    taken = (kept.values[1, :-1] * np.diff(kept.time_us)).sum()
+    assert taken == pytest.approx(joules[place[-1] - 1], rel=1e-12)
+
+
+def test_sensors_that_report_in_turn_all_stay_in_a_thinned_archive(database: Database) -> None:
+    values = np.full((4, 4000), np.nan)
+    for row in range(4):
+        values[row, row::4] = row
+    database.submit(samples.append, 1, Batch(np.arange(4000) * 1_000_000, values)).result()
+    kept = database.submit(selection.choose, 1, 4, None, None, 1000, True, [0, 1, 2, 3], []).result().samples
+    assert (np.isfinite(kept.values).sum(axis=1) >= 200).all()
+
+
+def test_a_job_takes_the_newest_samples_and_says_so(make_client: Any) -> None:
+    client = make_client(FakeWorkbench, job_values=1000)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, N, 500):
+        ingest(client, first, 500)
+    job = calibrate(client, {})
+    assert job["state"] == "succeeded", job["message"]
+    assert "the newest 333 of 3,000 samples" in job["message"]
+    taken = client.get(f"{TWIN}/models/1").json()["provenance"]["telemetry"]
+    assert (taken["samples"], taken["of"], taken["how"]) == (333, 3000, "newest")
+    job = calibrate(client, {"samples": 100, "thin": True})
+    assert "one in 30" in job["message"]
+    job = calibrate(client, {"samples": 5000})
+    assert "samples" not in job["message"].partition("; from")[2]
+    assert client.post(f"{TWIN}/calibrations", json={"samples": 3}).status_code == 422
+
+
+def test_a_window_knows_the_inputs_that_hold_where_it_begins(database: Database) -> None:
+    values = np.stack([np.full(100, 290.0), np.full(100, np.nan)])
+    values[1, 3] = 7.0
+    database.submit(samples.append, 1, Batch(np.arange(100) * 1_000_000, values)).result()
+    kept = database.submit(selection.choose, 1, 2, None, None, 50, False, [0], []).result().samples
+    assert kept.time_us[0] == 50_000_000 and kept.values[1, 0] == 7.0 and np.isnan(kept.values[1, 1:]).all()
+
+
+def _hoard(progress: Any) -> None:
+    kept = []
+    for _ in range(600):
+        kept.append(np.ones(2**20))  # eight megabytes at a time
+        time.sleep(0.02)
+
+
+def test_a_job_that_needs_too_much_memory_is_ended() -> None:
+    executor = ProcessPerTask(1, 60.0, 400.0)
+    with pytest.raises(JobFailed, match="400 MiB of memory"):
+        executor.submit(_hoard).result()
+    executor.shutdown()
+
+
+def test_a_new_model_follows_a_window_of_the_archive(make_client: Any) -> None:
+    client = make_client(FakeWorkbench, assimilate_samples=1000)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, N, 500):
+        ingest(client, first, 500)
+    calibrate(client, {})
+    found = client.get(f"{TWIN}/residuals").json()
+    assert found["samples"] == 1000 and found["time"][0] == "1970-01-01T00:33:20Z"
+    progress = client.get(TWIN).json()["assimilation"]
+    assert (progress["done"], progress["of"], progress["since"]) == (1000, 1000, "1970-01-01T00:33:20Z")
+    ingest(client, N, 10)
+    client.post(f"{TWIN}/telemetry", json={"time": [100.5, 2500.5], "values": {"T_px": [290.1, 292.5]}})
+    found = client.get(f"{TWIN}/residuals").json()  # the late one in the window counts, the other one is archived only
+    assert found["samples"] == 1011
+    forecast = client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()
+    assert forecast["from"] == "1970-01-01T00:50:09Z" and forecast["behind_s"] == 0.0
+    client.close()
+    client = make_client(FakeWorkbench, assimilate_samples=1000)
+    assert client.get(f"{TWIN}/residuals").json()["samples"] == 1011
+    assert client.get(TWIN).json()["assimilation"]["since"] == "1970-01-01T00:33:20Z"
+
+
+def test_answers_are_bounded_and_exports_are_whole(make_client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.http.routes.telemetry.USUAL_VALUES", 900)
+    monkeypatch.setattr("service.export.PIECE", 700)
+    client = make_client()
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, N, 500):
+        ingest(client, first, 500)
+    client.post(f"{TWIN}/telemetry", json={"time": [0.5], "values": {"T_px": [290.5]}})
+    plot = client.get(f"{TWIN}/telemetry").json()
+    assert len(plot["time"]) <= 300 and plot["samples"] == N + 1 and plot["downsampled"]
+    answer = client.get(f"{TWIN}/telemetry/export", params={"start": 0, "stop": 2000})
+    assert (
+        answer.headers["content-type"].startswith("text/csv")
+        and "benchsat.csv" in answer.headers["content-disposition"]
+    )
+    table = pd.read_csv(io.BytesIO(answer.content))
+    assert list(table.columns) == ["time", "T_px", "T_tank", "Q_px"] and len(table) == 2001
+    assert (
+        table["T_px"][1] == 290.5 and np.isnan(table["T_tank"][1]) and table["time"][1] == "1970-01-01T00:00:00.500000Z"
+    )
+    parquet = client.get(f"{TWIN}/telemetry/export", params={"format": "parquet", "channels": "T_tank,T_px"})
+    frame = pd.read_parquet(io.BytesIO(parquet.content))
+    assert list(frame.columns) == ["time", "T_tank", "T_px"] and len(frame) == N + 1
+    assert frame["time"].is_monotonic_increasing and frame["T_px"].to_numpy()[2:] == pytest.approx(
+        290 + 0.001 * np.arange(1, N)
+    )
+    assert client.get(f"{TWIN}/telemetry/export", params={"format": "xlsx"}).status_code == 422
+    assert client.get(f"{TWIN}/telemetry/export", params={"start": 1e9}).text == "time,T_px,T_tank,Q_px\r\n"
+
+
+def test_a_deleted_twin_goes_bit_by_bit_and_its_room_is_given_back(make_client: Any, tmp_path: Path) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, 40_000, 2000):
+        ingest(client, first, 2000)
+    calibrate(client, {})
+    client.get(f"{TWIN}/residuals")
+    assert client.delete(TWIN).status_code == 204
+    assert client.get(TWIN).status_code == 404
+    assert client.post("/v1/twins", json=SPEC).status_code == 201
+    assert client.get(TWIN).json()["samples"] == 0
+    assert client.post(f"{TWIN}/telemetry", json={"time": [1], "values": {"T_px": [290.0]}}).json()["accepted"] == 1
+    reader = sqlite3.connect(tmp_path / "twin.sqlite3")
+    for _ in range(300):
+        rows = (
+            reader.execute("SELECT count(*) FROM twin").fetchone()[0],
+            reader.execute("PRAGMA freelist_count").fetchone()[0],
+        )
+        if rows == (1, 0):
+            break
+        time.sleep(0.05)
+    assert rows == (1, 0)
+    for table in ("chunk", "residual", "checkpoint", "job", "model"):
+        assert reader.execute(f"SELECT count(*) FROM {table} WHERE twin = 1").fetchone()[0] == 0
+    reader.close()
+
+
+def test_residuals_take_less_room_than_the_archive_and_go_with_their_model(make_client: Any, tmp_path: Path) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, 9000, 3000):
+        ingest(client, first, 3000)
+    for _ in range(3):
+        calibrate(client, {"activate": True})
+        assert client.get(f"{TWIN}/residuals").json()["samples"] == 9000
+    with sqlite3.connect(tmp_path / "twin.sqlite3") as reader:
+        size = "SELECT sum(length(seq) + length(time) + length(value)) FROM {} WHERE twin = 1"
+        archive = reader.execute(
+            size.format("chunk").replace("length(value)", "length(value) + length(received)")
+        ).fetchone()[0]
+        one = reader.execute(size.format("residual") + " AND version = 3").fetchone()[0]
+        assert one <= 0.75 * archive
+        while client.portal.call(client.app.state.service.database.write, retention.sweep_old):
+            pass
+        assert reader.execute(size.format("residual")).fetchone()[0] <= archive
+    reader.close()
+    assert client.get(f"{TWIN}/residuals").json()["samples"] == 9000
+
+
+def test_retention_keeps_what_it_says(make_client: Any) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    for first in range(0, 9000, 1000):
+        ingest(client, first, 1000)
+    for _ in range(4):
+        calibrate(client, {"activate": True})
+    assert client.delete(f"{TWIN}/models/4").status_code == 409
+    assert client.delete(f"{TWIN}/models/1").status_code == 204
+    assert client.delete(f"{TWIN}/models/1").status_code == 404
+    kept = {"samples_days": 3000 / 86_400, "residuals_days": None, "models": 0, "jobs": 1}
+    assert client.request("PUT", f"{TWIN}/retention", json=kept).json() == kept
+    assert client.get(f"{TWIN}/retention").json() == kept
+    for _ in range(200):
+        versions = [model["version"] for model in client.get(f"{TWIN}/models").json()["models"]]
+        if versions == [3, 4] and client.get(TWIN).json()["samples"] <= 4000:  # the active one and its parent
+            break
+        time.sleep(0.05)
+    archive = client.get(f"{TWIN}/telemetry").json()
+    assert versions == [3, 4] and 3000 <= archive["samples"] <= 4000
+    assert archive["time"][0] == client.get(TWIN).json()["first_time"]
+    assert len(client.get(f"{TWIN}/calibrations").json()["jobs"]) == 1
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()["behind_s"] == 0.0
+    assert client.request("PUT", f"{TWIN}/retention", json={"samples_days": -1}).status_code == 422
