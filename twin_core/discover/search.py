@@ -46,6 +46,10 @@ COARSEST = 4.0
 """Variance, in units of the sensors' noise, up to which what stays unexplained may be a lumped network's coarseness: a misfit
 of two noises."""
 
+WIDENED = 1.0
+"""Variance, in units of the sensors' noise, that must stay unexplained beside a finding for pairs and trajectories to be
+asked as well: the coarseness of a lumped network is as large."""
+
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
 
@@ -97,12 +101,13 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
+    widened = not state.findings or mean_excess(state.trial) > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
-    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
+    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if told and by_heat.findings[-1].foresight < DOUBTFUL:
+    if not widened or (told and by_heat.findings[-1].foresight < DOUBTFUL):
         state.join(by_heat)
-        return True
+        return bool(told)
     second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback)
     seen = state.attempt(second, f"{what}, by open-loop residuals")
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
@@ -113,8 +118,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     return True
 
 
-def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
-    """Extend by what the innovations say, in the presence of latent heat."""
+def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool) -> bool:
+    """Extend by what the innovations say, in the presence of latent heat; by ``pairs`` where no single effect is supported."""
     screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
@@ -126,8 +131,8 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     singles = [(effect,) for effect in chosen]
     if accept(state, _by_heat(state, singles, n_tried), needed):
         return True
-    pairs = [] if fallback else _best_pairs(rankings[0], state.trial, needed)
-    return accept(state, _by_heat(state, pairs, max(n_tried**2 // 2, 1)), needed)
+    both = _best_pairs(rankings[0], state.trial, needed) if pairs and not fallback else []
+    return accept(state, _by_heat(state, both, max(n_tried**2 // 2, 1)), needed)
 
 
 def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:
