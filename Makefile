@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 
-.PHONY: demo test test-fast check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-service serve clean
+.PHONY: demo test test-fast check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -44,10 +44,19 @@ bench-measured: $(STAMP)
 bench-paper-a: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_a
 
+bench-experiments: $(BENCH)
+	$(BIN)/python -m benchmarks.next_experiment
+
 bench-loop: $(BENCH)
 	$(BIN)/python -m benchmarks.loop
 	$(BIN)/python -m benchmarks.band_study
 	$(BIN)/python -m benchmarks.loop_rivals
+
+bench-decoys: $(BENCH)
+	$(BIN)/python -m benchmarks.decoys
+
+bench-sufficiency: $(STAMP)
+	$(BIN)/python -m benchmarks.sufficiency
 
 bench-service: $(STAMP)
 	$(BIN)/python -m benchmarks.service

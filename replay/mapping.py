@@ -7,11 +7,21 @@ import numpy as np
 from replay.errors import MappingError
 from replay.recording import Recording
 
+MOST_NAMED = 10
+"""Topics that a message names."""
+
 
 def map_topics(
-    topics: Iterable[str], channels: Iterable[str], rename: Mapping[str, str] | None = None
+    topics: Iterable[str],
+    channels: Iterable[str],
+    rename: Mapping[str, str] | None = None,
+    *,
+    ignore_others: bool = False,
 ) -> dict[str, str]:
-    """Return which channel each topic feeds; topics that feed none are left out.
+    """Return which channel each topic feeds.
+
+    With ``ignore_others`` topics that feed none are left out; otherwise they are refused, for a recording of something else
+    may have some names in common with the twin.
 
     A topic named in ``rename`` feeds the channel given there. Any other feeds the channel of the same name, or else
     the one named by its last part: ``/bus/thermal/T_px`` and ``thermal.T_px`` both feed ``T_px``.
@@ -19,7 +29,8 @@ def map_topics(
     Raises
     ------
     MappingError
-        If ``rename`` names an unknown topic or channel, two topics feed one channel, or nothing fits at all.
+        If ``rename`` names an unknown topic or channel, two topics feed one channel, nothing fits at all, or some topics feed
+        no channel.
     """
     known, present = list(channels), list(topics)
     wanted = dict(rename or {})
@@ -35,6 +46,14 @@ def map_topics(
         mapping[topic] = channel
     if not mapping:
         raise MappingError(f"no topic ({', '.join(present)}) names a channel of the twin ({', '.join(known)})")
+    own = {f"residual_{channel}" for channel in known}  # as twin record writes them
+    others = [topic for topic in present if topic not in mapping and topic not in own]
+    if others and not ignore_others:
+        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        raise MappingError(
+            f"{len(others)} of {len(present)} topics feed no channel of the twin: {', '.join(others[:MOST_NAMED])}{more}; "
+            "--map names the channel of a topic, --ignore-others leaves them out"
+        )
     return mapping
 
 

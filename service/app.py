@@ -79,7 +79,15 @@ async def _running(
         service.add_twin(twin)
     dispatch = Dispatch(database)
     silence = Silence(service.registry, live_state, hub)
-    schedule = Schedule(database, service.registry, runner, settings.calibrate_every_s, settings.anomaly_patience_s)
+    schedule = Schedule(
+        database,
+        service.registry,
+        runner,
+        settings.calibrate_every_s,
+        settings.anomaly_patience_s,
+        settings.refutation_rate,
+        live_state.evidence,
+    )
     try:
         yield service
     finally:

@@ -92,14 +92,18 @@ class CoreWorkbench:
         return _outcome(model, {"rmse_K": model.summary.get("rmse_K"), "on": "its own training data"}, None)
 
     def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry."""
+        """Filter a stretch of telemetry; the state carries the evidence against the model along."""
+        from twin_core.anomaly.sufficiency import follow_evidence
         from twin_core.assimilate import assimilate
 
         model = _cached_model(document)
         done = assimilate(model, _record(model.spec, telemetry), state)
         if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
             raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
-        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state)
+        scaled = done.innovation_K / done.innovation_std_K
+        evidence, _ = follow_evidence((state or {}).get("evidence"), done.sensors, scaled)
+        after = done.state | {"evidence": evidence}
+        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, after)
 
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant."""

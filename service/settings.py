@@ -52,6 +52,12 @@ class Settings(BaseSettings):
     )
     calibrate_every_s: float | None = Field(None, gt=0, description="Recalibrate on this schedule; unset: on request.")
     anomaly_patience_s: float = Field(3600.0, ge=0, description="Recalibrate if an anomaly lasts so long; 0: never.")
+    refutation_rate: float = Field(
+        0.01,
+        ge=0,
+        lt=1,
+        description="False discovery rate at which models count as refuted and are diagnosed; 0: never.",
+    )
     false_alarm_rate: float = Field(
         2e-8, gt=0, le=1e-4, description="Chance that a statistic of a healthy sensor alarms at one sample."
     )

@@ -15,6 +15,7 @@ ROOMS = (
     *("constants", "errors", "_typing", "units", "files", "csv_table"),
     *("parameters", "telemetry", "orbit", "quality"),
     *("network", "gp", "telemetry_csv", "fem"),
+    "interchange",
     *("effects", "simulate", "latent_force"),
     "calibrate",
     *("assimilate", "anomaly", "forecast", "flows", "discover"),

@@ -9,7 +9,7 @@ from twin_core.effects import effect_to_json
 from twin_core.effects.heat import effect_heat_W
 from twin_core.forecast.assumed import future_record
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
-from twin_core.network.model import Network, conductor_name
+from twin_core.network.model import Network
 from twin_core.network.terms import Along, Term
 from twin_core.simulate.forcing import build_forcing
 from twin_core.telemetry import Record
@@ -88,9 +88,9 @@ def _conductors(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]
     links = []
     for conductor in model.spec.conductors:
         first, second = conductor.between
-        conductance = model.values[conductor_name(conductor.between)]
+        conductance = model.values[conductor.name]
         heat_W = conductance * (known_K[first] - known_K[second])
-        link = {"kind": "conductor", "ends": [first, second], "heat_W": heat_W}
+        link: Json = {"kind": "conductor", "ends": [first, second], "heat_W": heat_W}
         links.append({**link, "conductance_W_per_K": conductance})
     return links
 

@@ -14,6 +14,7 @@ from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
 from replay.cli.forecast import forecast
+from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, restore
 from replay.cli.play import replay
 from replay.cli.record import record
@@ -41,7 +42,7 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(demo, serve, register, simulate, replay, record, calibrate, forecast, close_loop, check_effect),
+    *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
     *(backup, restore, migrate),
 ):
     twin.add_command(command)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 @click.option("--rate", default="max", show_default=True, help="Recorded seconds per second, or max.")
 @click.option("--resume", is_flag=True, help="Leave out what the service already holds.")
 @click.option("--map", "renames", multiple=True, metavar="TOPIC=CHANNEL", help="A topic that feeds another channel.")
+@click.option("--ignore-others", is_flag=True, help="Leave out topics that feed no channel instead of refusing them.")
 @click.option("--key", envvar="TWIN_API_KEY", help="API key of the service.  [default: TWIN_API_KEY]")
 @click.option("--json", "as_json", is_flag=True, help="Print the outcome as JSON.")
 def replay(
@@ -34,6 +35,7 @@ def replay(
     rate: str,
     resume: bool,
     renames: tuple[str, ...],
+    ignore_others: bool,
     key: str | None,
     as_json: bool,
 ) -> int:
@@ -51,7 +53,7 @@ def replay(
     check_url(url)
     recordings = load(files)
     with TwinClient(url, key) as client:
-        tallies = [_send(r, client, twin, wanted, pace, resume) for r in recordings]
+        tallies = [_send(r, client, twin, wanted, pace, resume, ignore_others) for r in recordings]
     counted = ("sent", "accepted", "duplicates", "rejected", "quarantined")
     outcome = {name: sum(getattr(tally, name) for tally in tallies) for name in counted}
     outcome |= {"last_time": tallies[-1].last_time}
@@ -87,7 +89,13 @@ def check_url(url: str) -> None:
 
 
 def _send(
-    recording: "Recording", client: "TwinClient", twin: str, renames: dict[str, str], rate: float | None, resume: bool
+    recording: "Recording",
+    client: "TwinClient",
+    twin: str,
+    renames: dict[str, str],
+    rate: float | None,
+    resume: bool,
+    ignore_others: bool,
 ) -> "Tally":
     """Send one recording in the twin's channels and units, showing how far it got."""
     from replay.cli.console import progress_bar
@@ -102,7 +110,7 @@ def _send(
         detail = client.twin(twin)
     except (ApiError, Unreachable) as error:
         raise ReplayError(f"twin '{twin}': {error}") from error
-    mapping = map_topics(list(recording.columns), detail.channels, renames)
+    mapping = map_topics(list(recording.columns), detail.channels, renames, ignore_others=ignore_others)
     fitting = convert_units(apply_mapping(recording, mapping), load_spec(detail.specification), "the recording")
     begun_s = time.monotonic()
 

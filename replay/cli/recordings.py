@@ -192,7 +192,7 @@ def _from_recording(path: Path, recording: Recording, spec: TwinSpec, required: 
     name = str(path)
     topics = list(recording.columns)
     try:
-        mapping = map_topics(topics, list(spec.channels))
+        mapping = map_topics(topics, list(spec.channels), ignore_others=True)
     except ReplayError as error:
         raise TelemetryError(f"{name}: {error}") from error
     named = convert_units(apply_mapping(recording, mapping), spec, name)

@@ -1,17 +1,19 @@
-"""Recalibration without being asked: on a schedule, and when an anomaly lasts, less and less often while it helps nothing."""
+"""Work without being asked: recalibration on a schedule and when an anomaly lasts, and one diagnosis of a refuted model."""
 
 import asyncio
 import contextlib
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from service.errors import Refusal
 from service.jobs.runner import LEAST_SAMPLES, Jobs
 from service.registry import Entry, Registry
-from service.schemas import CalibrationRequest
-from service.store import anomalies, twins
+from service.schemas import CalibrationRequest, DiagnosisRequest
+from service.store import anomalies, jobs, twins
 from service.store.database import Database
+from twin_core.anomaly import adjusted, discoveries
 
 log = logging.getLogger("service.jobs")
 
@@ -28,6 +30,7 @@ class Watch:
     since_s: dict[int, float] = field(default_factory=dict)
     attempts: int = 0
     not_before_s: float = 0.0
+    refuted_s: float | None = None
 
     def due_by_schedule(self, now_s: float, every_s: float | None, samples: int) -> bool:
         """Return whether it is time again and there is something new to learn from."""
@@ -45,16 +48,35 @@ class Watch:
         self.not_before_s = now_s + min(patience_s * 2.0**self.attempts, max(LONGEST_BACK_OFF_S, patience_s))
         return True
 
+    def due_by_refutation(self, now_s: float, patience_s: float, is_refuted: bool) -> bool:
+        """Return whether the model has been refuted for as long as an anomaly must last: a recalibration goes first."""
+        if not is_refuted:
+            self.refuted_s = None
+        elif self.refuted_s is None:
+            self.refuted_s = now_s
+        return patience_s > 0.0 and self.refuted_s is not None and now_s - self.refuted_s >= patience_s
+
 
 class Schedule:
     """Looks at every twin now and then."""
 
     def __init__(
-        self, database: Database, registry: Registry, jobs: Jobs, every_s: float | None, patience_s: float
+        self,
+        database: Database,
+        registry: Registry,
+        jobs: Jobs,
+        every_s: float | None,
+        patience_s: float,
+        refutation_rate: float,
+        evidence: Callable[[Entry], float | None],
     ) -> None:
-        """Begin to look; ``every_s`` None and ``patience_s`` 0 switch the triggers off."""
+        """Begin to look; ``every_s`` None, ``patience_s`` 0 and ``refutation_rate`` 0 switch the triggers off.
+
+        ``evidence`` returns the greatest log evidence against the active model of a twin, None where it has none.
+        """
         self._database, self._registry, self._jobs = database, registry, jobs
         self._every_s, self._patience_s = every_s, patience_s
+        self._refutation_rate, self._evidence = refutation_rate, evidence
         self._watches: dict[int, Watch] = {}
         self._task = asyncio.create_task(self._run())
 
@@ -67,13 +89,20 @@ class Schedule:
     async def _run(self) -> None:
         while True:
             await asyncio.sleep(TICK_S)
+            refuted = self._refuted()
             for twin in self._registry:
                 try:
-                    await self._look(twin, time.monotonic())
+                    await self._look(twin, time.monotonic(), twin.key in refuted)
                 except Refusal as error:
                     log.info("no recalibration", extra={"twin": twin.name, "reason": error.detail})
 
-    async def _look(self, twin: Entry, now_s: float) -> None:
+    def _refuted(self) -> set[int]:
+        """Return the twins whose models fall together at the false discovery rate, whenever one looks."""
+        most = {twin.key: value for twin in self._registry if (value := self._evidence(twin)) is not None}
+        fallen = discoveries([adjusted(value) for value in most.values()], self._refutation_rate)
+        return {key for key, is_fallen in zip(most, fallen, strict=True) if is_fallen}
+
+    async def _look(self, twin: Entry, now_s: float, is_refuted: bool) -> None:
         head = await self._database.read(twins.get, twin.name)
         open_ids = await self._database.read(anomalies.open_ids, twin.key, head.active_version)
         watch = self._watches.setdefault(twin.key, Watch(now_s, 0))
@@ -86,3 +115,8 @@ class Schedule:
             watch.calibrated_s, watch.samples = now_s, head.samples
             request = CalibrationRequest().model_dump(mode="json") | {"trigger": triggers[-1]}
             await self._jobs.start(twin, "calibration", request)
+        if watch.due_by_refutation(now_s, self._patience_s, is_refuted) and not self._jobs.busy(twin):
+            watch.refuted_s = None
+            if not await self._database.read(jobs.asked_since_activation, twin.key, "diagnosis"):
+                request = DiagnosisRequest().model_dump(mode="json") | {"trigger": "refuted"}
+                await self._jobs.start(twin, "diagnosis", request)

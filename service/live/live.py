@@ -75,6 +75,11 @@ class Live:
         """Return the tracker of a twin, None if nothing follows its samples."""
         return self._trackers.get(twin)
 
+    def evidence(self, twin: Entry) -> float | None:
+        """Return the greatest log evidence against the active model of a twin; None where nothing is followed."""
+        tracker = self._trackers.get(twin.key)
+        return None if tracker is None else tracker.evidence
+
     def arrived(self, twin: Entry) -> None:
         """Pass on that samples were stored."""
         self._limits.arrived(twin)

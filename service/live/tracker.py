@@ -110,6 +110,12 @@ class Tracker:
         scout = self._scout
         return scout.base if scout is not None and scout.position is self.position is not None else None
 
+    @property
+    def evidence(self) -> float | None:
+        """The greatest log evidence against the active model so far; None where nothing is followed."""
+        known = None if self._at is None else self._at.state.get("evidence")
+        return None if known is None else float(known["most"])
+
     def arrived(self) -> None:
         """Hear that samples were stored."""
         self._idle.clear()

@@ -79,6 +79,13 @@ def select(connection: Connection, twin: int, kind: str) -> list[JobRow]:
     return [JobRow(*row) for row in connection.execute(query, (twin, kind))]
 
 
+def asked_since_activation(connection: Connection, twin: int, kind: str) -> bool:
+    """Return whether a job of one kind was asked for since the active model became that."""
+    query = """SELECT EXISTS (SELECT 1 FROM job WHERE twin = ? AND kind = ? AND created_us >=
+               (SELECT at_us FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1))"""
+    return bool(connection.execute(query, (twin, kind, twin)).fetchone()[0])
+
+
 def begin(connection: Connection, job: str) -> None:
     """Mark a queued job as running."""
     query = "UPDATE job SET state = 'running', started_us = ?, message = 'starting' WHERE id = ? AND state = 'queued'"

@@ -12,7 +12,7 @@ CHANNELS = ["T_px", "Q_px"]
 
 @pytest.mark.parametrize("topic", ["T_px", "/T_px", "/bus/thermal/T_px", "/thermal.T_px", "/bus/T_px.reading"])
 def test_last_part_of_a_topic_names_the_channel(topic: str) -> None:
-    assert map_topics([topic, "/camera"], CHANNELS) == {topic: "T_px"}
+    assert map_topics([topic, "/camera"], CHANNELS, ignore_others=True) == {topic: "T_px"}
 
 
 def test_rename_goes_before_the_name() -> None:
@@ -37,3 +37,11 @@ def test_instants_of_which_no_channel_knows_are_left_out() -> None:
 def test_wrong_mappings_are_named(topics: list[str], rename: dict[str, str], reason: str) -> None:
     with pytest.raises(MappingError, match=reason):
         map_topics(topics, CHANNELS, rename)
+
+
+def test_a_recording_of_something_else_is_not_taken_for_one_of_the_twin() -> None:
+    with pytest.raises(
+        MappingError, match=r"2 of 3 topics feed no channel of the twin: /camera, /lidar; --map .* --ignore-others"
+    ):
+        map_topics(["T_px", "/camera", "/lidar"], CHANNELS)
+    assert map_topics(["T_px", "/lidar"], CHANNELS, {"/lidar": "Q_px"}) == {"T_px": "T_px", "/lidar": "Q_px"}

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from service.client import TwinClient
 from tests.service.harness import AppClient
 from tests.service.server import Server
-from tests.service.test_end_to_end import simulate
 
 DOCS = Path(__file__).parents[2] / "docs"
 GUIDE = (DOCS / "operating.md").read_text()
@@ -39,12 +37,6 @@ def server(tmp_path: Path) -> Iterator[Server]:
         yield running
 
 
-def telemetry() -> dict[str, list[float]]:
-    truth = simulate()
-    columns = {"T_a": truth["T_a"], "T_b": truth["T_b"], "Q_a": truth["Q"]}
-    return {name: np.round(column[:121], 4).tolist() for name, column in columns.items()}
-
-
 def finish(client: TwinClient) -> None:
     """Wait for every calibration."""
     while not all(job["finished"] for job in client._http.get("/v1/twins/pair/calibrations").json()["jobs"]):
@@ -54,27 +46,21 @@ def finish(client: TwinClient) -> None:
 @pytest.mark.e2e
 @pytest.mark.slow
 def test_the_guide_runs(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
-    sent, columns = requests(), telemetry()
+    sent = requests()
     assert len(sent) >= 9 and sent[0][1] == "/v1/twins"
-    client, begin_s = server.client(), 1772323200.0 - 7200.0  # the guide's own sample comes last
-    for method, path, body in sent:
-        if path == "/v1/twins/pair/calibrations" and method == "POST":
-            client.ingest("pair", [begin_s + 60.0 * k for k in range(120)], {n: c[:120] for n, c in columns.items()})
+    past, program = re.findall(r"^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
+    client = server.client()
+    for number, (method, path, body) in enumerate(sent):
+        if number == 1:
+            exec(compile(past.replace("http://127.0.0.1:8000", server.url), "operating.md", "exec"), {})
         if path.endswith("/activate"):
             finish(client)
-        if body is not None and "plan" in body:
-            body["plan"]["time"] = [begin_s + 7260.0, begin_s + 8000.0]  # noon is too far for two hours of archive
         if path.endswith("/events"):
             assert next(client.events("pair", after_seq=0)).seq >= 1
             continue
         response = client._http.request(method, path, json=body)
         assert response.is_success, (path, response.text)
-    (program,) = re.findall(r"^```python\n(.*?)^```", GUIDE, re.MULTILINE | re.DOTALL)
-    names = {
-        "specification": sent[0][2],
-        "times": [begin_s + 7260.0],
-        "values": {name: column[120:] for name, column in columns.items()},
-    }
+    names = {"specification": sent[0][2]}
     exec(compile(program.replace("http://127.0.0.1:8000", server.url), "operating.md", "exec"), names)
     printed = capsys.readouterr().out
     assert "version 2 is" in printed and " K" in printed

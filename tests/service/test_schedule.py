@@ -1,10 +1,12 @@
 """When a twin is recalibrated without being asked."""
 
 import time
+from dataclasses import replace
 
 import pytest
 
 from service.jobs.schedule import LONGEST_BACK_OFF_S, Watch
+from service.workbench import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 
@@ -58,3 +60,34 @@ def test_a_running_service_recalibrates_by_itself(make_client, settings: dict) -
         time.sleep(0.05)
     newest = client.get(f"{TWIN}/models").json()["models"][-1]
     assert newest["provenance"]["settings"]["trigger"] == ("schedule" if "calibrate_every_s" in settings else "anomaly")
+
+
+def test_a_refutation_must_last_and_a_model_that_recovers_is_left_alone() -> None:
+    watch = Watch(0.0, 0)
+    assert not watch.due_by_refutation(0.0, 100.0, True)
+    assert not watch.due_by_refutation(99.0, 100.0, True)
+    assert watch.due_by_refutation(100.0, 100.0, True)
+    assert not watch.due_by_refutation(101.0, 100.0, False)
+    assert not watch.due_by_refutation(150.0, 100.0, True)
+    assert not watch.due_by_refutation(1e9, 0.0, True)
+
+
+class Refuting(FakeWorkbench):
+    """Says that telemetry speaks against its model."""
+
+    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        done = super().assimilate(document, telemetry, state)
+        return replace(done, state=done.state | {"evidence": {"sensors": {}, "most": 30.0}})
+
+
+def test_a_refuted_model_is_diagnosed_once(make_client) -> None:
+    client = make_client(workbench=Refuting, anomaly_patience_s=0.5)
+    client.post("/v1/twins", json=SPEC)
+    values = {"T_px": [0.0] * 60, "T_tank": [0.0] * 60, "Q_px": [0.5] * 60}
+    client.post(f"{TWIN}/telemetry", json={"time": list(range(60)), "values": values})
+    client.post(f"{TWIN}/calibrations", json={"activate": True})
+    deadline = time.monotonic() + 30.0
+    while not client.get(f"{TWIN}/diagnoses").json()["jobs"] and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(2.5)  # two more looks of the schedule
+    assert [job["kind"] for job in client.get(f"{TWIN}/diagnoses").json()["jobs"]] == ["diagnosis"]

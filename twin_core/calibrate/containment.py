@@ -1,7 +1,9 @@
 """What ends one start or refinement, and never the run: failures of arithmetic, and the time that is up."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 from numpy.linalg import LinAlgError
@@ -12,6 +14,28 @@ NUMERICAL_FAILURES = (LinAlgError, ArithmeticError)
 NO_DEADLINE = float("inf")
 
 T = TypeVar("T")
+
+_limit: ContextVar[float] = ContextVar("limit", default=NO_DEADLINE)
+
+
+class TimeIsUpError(Exception):
+    """A computation went on past its limit and was given up."""
+
+
+@contextmanager
+def limited(deadline: float) -> Iterator[None]:
+    """Let :func:`check_time` raise in this thread from ``deadline`` on, on the clock of ``time.monotonic``."""
+    token = _limit.set(min(deadline, _limit.get()))
+    try:
+        yield
+    finally:
+        _limit.reset(token)
+
+
+def check_time() -> None:
+    """Raise TimeIsUpError where the time that :func:`limited` leaves is over; iterations call it once each."""
+    if is_late(_limit.get()):
+        raise TimeIsUpError("the time is up")
 
 
 def is_late(deadline: float) -> bool:

@@ -177,7 +177,9 @@ def strong_correlations(
 
 def unseen_nodes(spec: TwinSpec, joined: Sequence[Sequence[str]] = ()) -> list[str]:
     """Return a statement for every node that no chain of conductors, or of pairs ``joined`` besides, ties to a sensor."""
-    pairs = [set(pair) for pair in (*(c.between for c in spec.conductors), *joined)]
+    pairs = [
+        set(pair) for pair in (*(c.between for c in spec.conductors), *(r.between for r in spec.radiation), *joined)
+    ]
     nodes = {node.id for node in spec.nodes}
     seen = {node.id for node in spec.nodes if node.sensors}
     for _ in nodes:

@@ -11,6 +11,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
+from twin_core.calibrate.containment import NO_DEADLINE, check_time, is_late
 from twin_core.calibrate.latent_heat import (
     HeatFit,
     LatentHeat,
@@ -121,6 +122,7 @@ def fit_with_latent_heat(
     n_passes: int = 12,
     leashes: Sequence[float] = LEASHES,
     resized: Sequence[int] | None = None,
+    deadline: float = NO_DEADLINE,
 ) -> HeatFit:
     """Fit the free parameters in the presence of latent heat.
 
@@ -139,6 +141,8 @@ def fit_with_latent_heat(
     resized
         Nodes on which the latent heat is sized anew, beside one factor for all; by default all, and its length. With
         ``near`` only.
+    deadline
+        On the clock of ``time.monotonic``: no pass but the first is begun afterwards.
 
     Returns
     -------
@@ -150,28 +154,40 @@ def fit_with_latent_heat(
     if near is not None:
         nominals, latent = _carried_over(problem, values, near)
         sizes = new_search(problem.n_nodes, 1.5)
-        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes, resized)
+        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes, resized, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
     )
     typical = first_size(problem, first)
-    started = []
+    started: list[tuple[HeatFit, SizeSearch]] = []
     for share in START_SHARES:
+        if started and is_late(deadline):
+            break
         fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
         sizes = new_search(problem.n_nodes, LARGEST_LOG_STEP)
         for leash in leashes:
+            if is_late(deadline) and np.isfinite(fit.log_likelihood):
+                break
             fit = _pass(fit, sizes, leash, smoothing=True)
         started.append((fit, sizes))
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
-    return _settle(fit, sizes, n_passes)
+    return _settle(fit, sizes, n_passes, deadline=deadline)
 
 
-def _settle(fit: HeatFit, sizes: SizeSearch, n_passes: int, resized: Sequence[int] | None = None) -> HeatFit:
+def _settle(
+    fit: HeatFit,
+    sizes: SizeSearch,
+    n_passes: int,
+    resized: Sequence[int] | None = None,
+    deadline: float = NO_DEADLINE,
+) -> HeatFit:
     """Take passes until the likelihood no longer grows."""
     refused = 0
     for _ in range(n_passes):
         before, free = fit.log_likelihood, fit.free
+        if is_late(deadline) and np.isfinite(before):
+            break
         fit = _pass(fit, sizes, np.inf, resized=resized, still=refused >= MOST_REFUSED)
         refused = refused + 1 if np.array_equal(free, fit.free) else 0
         small = (sizes.log_step[list(sizes.positions(resized))] < SETTLED_LOG_STEP).all()
@@ -190,6 +206,7 @@ def _pass(
     still: bool = False,
 ) -> HeatFit:
     """Relinearise about smoothed temperatures where asked, improve parameters but for ``still``, then the heat's size."""
+    check_time()
     problem, nominals = fit.problem, fit.nominals
     if smoothing:
         nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)

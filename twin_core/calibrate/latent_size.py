@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.calibrate.containment import check_time
 from twin_core.calibrate.latent_heat import LatentHeat, Nominal, log_likelihood
 from twin_core.calibrate.problem import Problem
 
@@ -46,6 +47,7 @@ class SizeSearch:
         """
         best, value = latent, log_likelihood(problem, latent, nominals)
         for position in self.positions(nodes):
+            check_time()
             moved = False
             for sign in (-1.0, 1.0):
                 trial = self._changed(best, position, sign, nominals)
@@ -92,5 +94,6 @@ def first_size(problem: Problem, nominals: Sequence[Nominal]) -> LatentHeat:
 
 def fit_common(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
     """Return the best common factor of the latent heat, and its likelihood."""
+    check_time()
     trials = [replace(latent, std_W=latent.std_W * f) for f in (10.0, 2.0, 0.4, 0.08, 0.016)]
     return max(((t, log_likelihood(problem, t, nominals)) for t in trials), key=lambda item: item[1])

@@ -9,7 +9,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
-from twin_core.calibrate.containment import NO_DEADLINE, NUMERICAL_FAILURES, is_late
+from twin_core.calibrate.containment import NO_DEADLINE, NUMERICAL_FAILURES, check_time, is_late
 from twin_core.calibrate.problem import Fit, Problem
 
 Status = Literal[
@@ -110,6 +110,7 @@ def minimise(
     status: Status = "iteration_limit"
     iterations = 0
     while iterations < max_iterations:
+        check_time()
         if is_late(deadline):
             status = "deadline"
             break

@@ -9,7 +9,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
-from twin_core.calibrate.containment import NO_DEADLINE, attempted
+from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.calibrate.covariance import is_open_ended, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
@@ -135,7 +135,12 @@ def prepare(
 
 
 def fit_network(
-    spec: TwinSpec, records: Sequence[Record], effects: Sequence[Effect] = (), *, progress: Progress = no_progress
+    spec: TwinSpec,
+    records: Sequence[Record],
+    effects: Sequence[Effect] = (),
+    *,
+    deadline: float = NO_DEADLINE,
+    progress: Progress = no_progress,
 ) -> tuple[HeatFit, Calibration]:
     """Calibrate a declared network, with effects if any, against telemetry.
 
@@ -143,6 +148,9 @@ def fit_network(
     ----------
     spec, records, effects
         As in :func:`prepare`.
+    deadline
+        On the clock of ``time.monotonic``: what is there by then counts; one trajectory and one fit in the presence of
+        latent heat are made in any case.
     progress
         Called with the fraction done.
 
@@ -163,21 +171,22 @@ def fit_network(
     progress(0.1, "fitting open-loop trajectories")
     failures: list[str] = []
     coarse = coarse_problem(problem, step)
-    search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples)
+    search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples, deadline=deadline)
     problem = recentred(problem, search.best)
-    found = [attempted(partial(minimise, problem, search.best.unknowns), "open-loop trajectories", failures)]
+    on_trajectories = partial(minimise, problem, deadline=deadline)
+    found = [attempted(partial(on_trajectories, search.best.unknowns), "open-loop trajectories", failures)]
     progress(0.4, "fitting in the presence of latent heat")
-    fits = [attempted(partial(fit_with_latent_heat, problem), "latent heat", failures)]
-    found += [
-        attempted(partial(minimise, problem, f.unknowns()), "open-loop trajectories", failures) for f in fits if f
-    ]
+    fits = [attempted(partial(fit_with_latent_heat, problem, deadline=deadline), "latent heat", failures)]
+    found += [attempted(partial(on_trajectories, f.unknowns()), "open-loop trajectories", failures) for f in fits if f]
     optima = [o for o in found if o is not None and o.status != "no_solution"]
     if not optima:
         raise NoSolutionError(f"calibration failed: {'; '.join(failures) or ADVICE['no_solution']}")
     optimum = min(optima, key=lambda o: o.fit.cost)
-    progress(0.8, "fitting again in the presence of latent heat")
-    free, leashes = optimum.unknowns[: problem.n_free], (np.inf,) * 3
-    fits.append(attempted(partial(fit_with_latent_heat, problem, free, leashes=leashes), "latent heat", failures))
+    if fits == [None] or not is_late(deadline):
+        progress(0.8, "fitting again in the presence of latent heat")
+        free, leashes = optimum.unknowns[: problem.n_free], (np.inf,) * 3
+        again = partial(fit_with_latent_heat, problem, free, leashes=leashes, deadline=deadline)
+        fits.append(attempted(again, "latent heat", failures))
     heat_fits = [f for f in fits if f is not None]
     if not heat_fits:
         raise NoSolutionError(f"calibration failed: {'; '.join(failures)}: check the units of loads and known values")

@@ -7,7 +7,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
+from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.effects.base import Effect
@@ -121,14 +121,15 @@ class Search:
 
     def attempt(self, work: Callable[[], T], what: str) -> T | None:
         """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``."""
-        if is_late(self.deadline):
-            self.left_out.append(what)
-            return None
         try:
-            return attempted(work, what, self.failures)
+            with limited(self.deadline):
+                check_time()
+                return attempted(work, what, self.failures)
+        except TimeIsUpError:
+            self.left_out.append(what)
         except ModelError as error:
             self.failures.append(f"{what}: {error}")
-            return None
+        return None
 
     def count(self, n_looked_at: int, *, fallback: bool) -> int:
         """Return how many effects and places were tried: a fallback comes after all the named ones."""

@@ -28,6 +28,9 @@ from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
 from twin_core.telemetry import Record, cut_at_gaps
 
+AFTERWARDS = 0.1
+"""Share of the deadline that the witness may take beyond it."""
+
 
 @dataclass(frozen=True)
 class ClosedLoop:
@@ -86,9 +89,10 @@ def close_loop(
         raise TelemetryError(f"deadline_s: must be a positive number of seconds (got {deadline_s:g})")
     begun = time.perf_counter()
     deadline = NO_DEADLINE if deadline_s is None else time.monotonic() + deadline_s
+    latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
         return _close_loop(
-            spec, records, holdout, holdout_records, burn_in_s, false_alarm_rate, deadline, begun, progress
+            spec, records, holdout, holdout_records, burn_in_s, false_alarm_rate, deadline, latest, begun, progress
         )
 
 
@@ -100,14 +104,19 @@ def _close_loop(
     burn_in_s: float | None,
     false_alarm_rate: float,
     deadline: float,
+    latest: float,
     begun: float,
     progress: Progress,
 ) -> ClosedLoop:
-    """Close the loop on checked arguments; ``begun`` is on the clock of ``time.perf_counter``."""
+    """Close the loop on checked arguments.
+
+    The search ends at ``deadline``, and the witness, which decides nothing, at ``latest``, on the clock of
+    ``time.monotonic``; ``begun`` is on that of ``time.perf_counter``.
+    """
     records = [screened(spec, record) for record in records]
     holdout_records = [screened(spec, record) for record in holdout_records or ()]
     train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
-    fit, calibration = fit_network(spec, train, progress=lambda f, m: progress(0.35 * f, m))
+    fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
     found = search(
@@ -121,7 +130,7 @@ def _close_loop(
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found))
     progress(0.93, "drawing")
-    witness = bear_witness(found)
+    witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)
     plots = build_plots(found, before, after, held, predictions, report, witness)
     report["quality"] = quality_json([*records, *holdout_records])

@@ -32,6 +32,10 @@ def headline(report: Mapping[str, Any]) -> str:
         more = len(findings) - 1
         others = f"; {more} more effect{'s were' if more > 1 else ' was'} found" if more else ""
         return f"{sentence(findings[0], capital=True)}{others}."
+    if (report.get("search") or {}).get("complete") is False:
+        if verdict == "unexplained":
+            return "Something is missing from the model; the deadline ended the search before an effect explained it."
+        return "No missing effect was found before the deadline ended the search; not all was looked at."
     if verdict == "unexplained":
         return "Something is missing from the model, and no known effect explains it."
     return "The declared model suffices: the data supports no missing effect."

@@ -123,7 +123,7 @@ def _law(law: ForcePolynomial, visited_K: FloatArray) -> Json:
 def _network(model: CalibratedModel) -> Json:
     """Return the network as a drawing needs it."""
     spec, values = model.spec, model.values
-    conductors: list[list[Any]] = [[*c.between, values[f"G:{c.between[0]}|{c.between[1]}"]] for c in spec.conductors]
+    conductors: list[list[Any]] = [[*c.between, values[c.name]] for c in spec.conductors]
     return {
         "nodes": [node.id for node in spec.nodes],
         "boundaries": list(spec.boundaries),

@@ -220,6 +220,7 @@ def build_report(
         },
         "parameters": parameter_rows(search, before, after),
         "failures": list(dict.fromkeys(search.failures)),
+        "search": {"complete": not search.left_out, "left_out": len(search.left_out)},
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),

@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.calibrate.containment import check_time
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.calibrate.starting import channel_levels
 from twin_core.effects.base import Effect, Survey
@@ -242,6 +243,7 @@ def _portions(
     columns: list[Column] = []
     edges = [0]
     for effect in effects:
+        check_time()
         own = list(zip(effect.unit_heats(survey), effect.unit_readings(survey), strict=True))
         if some and len(columns) + len(own) > limit:
             yield some, edges, responses(fit, survey, columns)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import FloatArray, Json
+from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, is_late, limited
 from twin_core.calibrate.latent_heat import HeatFit, Nominal, floor_K2
 from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
 from twin_core.discover.followed import followed
@@ -19,6 +20,7 @@ from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
 from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.declared import declared_model
+from twin_core.latent_force.linearised import Linearised
 from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
 from twin_core.latent_force.regression import learn_heat_flow
@@ -155,7 +157,7 @@ class Witness:
         return [heat.words() for heat in self.heats]
 
 
-def bear_witness(search: Search) -> Witness:
+def bear_witness(search: Search, *, deadline: float = NO_DEADLINE) -> Witness:
     """Smooth the missing heat at the nodes of interest of the declared model, over the last training segment.
 
     Trouble with the numbers is told in the notices, never raised: the finding stands without its witness.
@@ -164,14 +166,18 @@ def bear_witness(search: Search) -> Witness:
     ----------
     search
         A finished search; its base is the declared model.
+    deadline
+        On the clock of ``time.monotonic``: without time left there are no heats, and a notice.
     """
     nodes = nodes_of_interest(search)
     try:
-        force, model, observations, values, view = _smoothed(search.base.fit, nodes)
-    except (TwinError, ArithmeticError, np.linalg.LinAlgError) as error:
+        with limited(deadline):
+            check_time()
+            force, model, observations, values, view = _smoothed(search.base.fit, nodes)
+    except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
         return Witness((), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",))
     watched = [force.nodes.index(search.base.fit.network.nodes.index(node)) for node in nodes]
-    laws, notices = _laws(model, observations, values, force, watched)
+    laws, notices = ({}, []) if is_late(deadline) else _laws(model, observations, values, force, watched)
     if view.first_step > 0:
         notices.append(
             f"missing heat: smoothed over the last {np.ptp(force.time_s):.0f} s of the training record alone"
@@ -256,7 +262,12 @@ def _smoothed(fit: HeatFit, nodes: Sequence[str]) -> tuple[LatentForce, ForceMod
     std = fit.latent.std_W.copy()
     std[watched] = np.maximum(std[watched], np.maximum(SMALLEST_SHARE * turnover[watched], 1e-6))
     at = [i for i in range(std.size) if i in watched or std[i] > 1e-4 * turnover[i]]
-    about = linearise_network(network, view.forcing)
+    linearised = linearise_network(network, view.forcing)
+
+    def about(states_K: FloatArray) -> Linearised:
+        check_time()
+        return linearised(states_K)
+
     model = _model(fit, nominal, view, at, states)
     values = np.ravel([[std[i], fit.latent.length_s] for i in at])
     readings = _readings(network, nominal)[nominal.segment.forcing.sample_step >= view.first_step]

@@ -62,7 +62,9 @@ class ChannelHeatLoad(Effect):
         if "across" not in own:
             return Addition((TableLoad(node, channel, knots, bool(own["levels"]), 1.0, False, parameters),))
         solar, states, rests = bool(own["solar"]), tuple(own["states"]), tuple(own["levels"])
-        table = SteeredTable(node, own["across"], knots, False, 1.0, solar, parameters, (), states, channel, rests)
+        table = SteeredTable(
+            node, own["across"], knots, False, 1.0, solar, parameters, (), None, states, channel, rests
+        )
         return Addition((table,))
 
     @classmethod
@@ -70,9 +72,9 @@ class ChannelHeatLoad(Effect):
         """Yield every node with every auxiliary channel, but where a table of that channel is declared.
 
         Not the parts of a quaternion, which mean nothing one by one, nor the orbit's angle to the Sun, which moves so
-        slowly that it would explain any drift.
+        slowly that it would explain any drift; nor what a formula gives, whose channels stand for themselves.
         """
-        mute = {f"{PREFIX}{BETA}", *layout.spec.attitude_channels}
+        mute = {f"{PREFIX}{BETA}", *layout.spec.attitude_channels, *layout.spec.derived}
         declared = {(load.channel, load.node) for load in layout.spec.loads if load.table is not None}
         auxiliary = [name for name, c in layout.spec.inputs.items() if c.kind == "auxiliary" and name not in mute]
         for node in layout.declared_nodes:

@@ -49,13 +49,13 @@ class Changed:
 
 def conductor_places(layout: Layout) -> Iterable[Where]:
     """Yield every declared conductor; an end may be a boundary."""
-    yield from ({"nodes": list(conductor.between)} for conductor in layout.spec.conductors)
+    yield from ({"nodes": list(conductor.between)} for conductor in layout.spec.conductors if conductor.into is None)
 
 
 def declared_conductor(effect: Effect, layout: Layout) -> tuple[PairConductor | BoundaryConductor, str]:
     """Return the conductor at the effect's place and the name of its conductance; ModelError if none is declared."""
     pair = frozenset(effect.where["nodes"])
-    found = [c.between for c in layout.spec.conductors if frozenset(c.between) == pair]
+    found = [c.between for c in layout.spec.conductors if frozenset(c.between) == pair and c.into is None]
     if not found:
         raise ModelError(f"effect {effect.name}: no declared conductor joins {' and '.join(effect.where['nodes'])}")
     between = found[0]

@@ -1,7 +1,6 @@
 """An undeclared proportional heater: heat in proportion to how far a node is below a set-point, up to its power."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -9,39 +8,11 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
-from twin_core.network.terms import Along, Entry, Heat
-from twin_core.parameters.parameter import Parameter
+from twin_core.network.terms import ProportionalHeat
 
 SET_POINT_QUANTILES = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9, 1.0)
 SATURATED_SHARES = (0.0, 0.3, 0.6)
 """Share of the heated time at full power that a starting point assumes."""
-
-
-@dataclass(frozen=True)
-class ProportionalHeat:
-    """q = min(Q, k (T_set - T)) below T_set, else 0; values are k, T_set, Q."""
-
-    node: int
-    parameters: tuple[Parameter, ...]
-    borrows: tuple[str, ...] = ()
-
-    def evaluate(self, along: Along, values: FloatArray) -> Heat:
-        """Evaluate the heater; at k = 0 the derivative by k is that of a heater limited to Q = k (T_set - T_full)."""
-        gain, set_point, limit = values
-        below = np.maximum(set_point - along.temperatures_K[:, self.node], 0.0)
-        full = gain * below >= limit
-        heated = (below > 0.0) & ~full
-        zero = np.zeros_like(below)
-        return Heat(
-            (self.node,),
-            np.where(full, limit, gain * below)[:, None],
-            np.where(heated, -gain, 0.0)[:, None, None],
-            [
-                Entry(0, self.node, np.where(full, zero, below)),
-                Entry(1, self.node, np.where(heated, gain, 0.0)),
-                Entry(2, self.node, np.where(full, 1.0, zero)),
-            ],
-        )
 
 
 class ProportionalHeater(Effect):

@@ -35,6 +35,7 @@ def isolated(spec: TwinSpec) -> tuple[str, ...]:
     """Return a sentence for every node that has neither a coupling nor a load."""
     reached = {end for conductor in spec.conductors for end in conductor.between}
     reached |= {radiator.node for radiator in spec.radiators} | {load.node for load in spec.loads}
+    reached |= {end for coupling in spec.radiation for end in coupling.between} | {h.node for h in spec.heaters}
     return tuple(
         f"node '{node.id}' has no coupling and no load: nothing can change its temperature; declare what does"
         for node in spec.nodes
@@ -84,7 +85,7 @@ def _too_fast(spec: TwinSpec, record: Record, channel: str) -> float:
     for load in spec.loads:
         node = next(node for node in spec.nodes if node.id == load.node)
         capacity = guess_or(node.capacity_J_per_K, 0.0)
-        if load.channel != channel or load.gain is not None or load.table is not None or capacity == 0.0:
+        if load.channel != channel or load.gain or load.table or load.factor or capacity == 0.0:
             continue
         heat_W = load.weight * _largest_step(column)
         seen_K = max((_largest_step(record.values[s]) for s in node.sensors if s in record.values), default=0.0)

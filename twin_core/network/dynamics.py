@@ -123,7 +123,7 @@ def evaluate_balance(
     for position in range(len(network.terms)) if only is None else only:
         index = network.term_indices[position]
         part = network.terms[position].evaluate(around.along, values[index])
-        jacobian.add(part)
+        jacobian.add(part, along.temperatures_K)
         for e in part.d_boundaries:
             for state, series in around.by_state.get(e.item, ()):
                 jacobian.add_entry(e.node, state, e.series * series)

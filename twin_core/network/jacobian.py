@@ -70,9 +70,14 @@ class JacobianSum:
         self.constant = np.zeros((n_nodes, n_nodes))
         self.moving: list[tuple[int, int, FloatArray]] = []
 
-    def add(self, part: Heat) -> None:
-        """Add d heat / d temperature of one term."""
+    def add(self, part: Heat, temperatures_K: FloatArray) -> None:
+        """Add d heat / d temperature of one term at temperatures (n_points, n_nodes)."""
         nodes = np.asarray(part.nodes)
+        if part.fourth_W_per_K4 is not None and part.d_temperature.size == 0:
+            slopes = 4.0 * temperatures_K[:, nodes] ** 3
+            for a, b in np.argwhere(part.fourth_W_per_K4):
+                self.moving.append((int(nodes[a]), int(nodes[b]), part.fourth_W_per_K4[a, b] * slopes[:, b]))
+            return
         if part.d_temperature.shape[0] == 1:
             self.constant[nodes[:, None], nodes] += part.d_temperature[0]
             return

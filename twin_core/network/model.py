@@ -1,7 +1,7 @@
 """A network ready to be evaluated: the declared specification and any added effects as terms over one parameter set."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -9,22 +9,34 @@ from typing import Protocol
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.errors import ModelError
 from twin_core.network.quantities import Quantity, Tied, guess_or
-from twin_core.network.spec import Channel, Load, TwinSpec
+from twin_core.network.spec import Channel, Conductor, Heater, Load, Node, TwinSpec
 from twin_core.network.terms import (
     BoundaryConductor,
     BoundaryTerm,
     CapacityTerm,
     ChannelLoad,
     Conductors,
+    NodeRadiation,
+    OneWayConductor,
+    ProportionalHeat,
     ReadingTerm,
     SinkRadiation,
     TableLoad,
     Term,
 )
+from twin_core.network.thermostat import Memory, ThermostatHeat
 from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD, Parameter, positive, real
 from twin_core.parameters.vector import ParameterSet
+
+ARITHMETIC_S, ROOM_K = 1e-3, 293.0
+"""Time constant of a node that stores nothing: it lags by this times the rate of its neighbours, microkelvins in orbit, and
+keeps ten digits of the slow modes in the eigenvalues. Radiation counts as at room temperature."""
+
+MEMORY_S, APPROACH_K_PER_S = 0.1, 1e-3
+"""Of a declared thermostat: how fast its memory follows, and how fast its node came to a threshold before a record began."""
 
 SINK_STD_K = 50.0
 """Prior standard deviation of an unknown sink whose guess comes without a spread."""
@@ -96,9 +108,13 @@ class Layout:
 
     def node(self, name: str) -> int:
         """Return the position of a node; ModelError if there is none of that name."""
-        if name not in self.nodes:
+        if name not in self._node_index:
             raise ModelError(f"unknown node '{name}' (known: {', '.join(self.nodes)})")
-        return self.nodes.index(name)
+        return self._node_index[name]
+
+    @cached_property
+    def _node_index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.nodes)}
 
     def boundary(self, name: str) -> int:
         """Return the position of a boundary; ModelError if there is none of that name."""
@@ -114,7 +130,11 @@ class Layout:
 
     def sensor_node(self, name: str) -> str:
         """Return the node that a sensor reads."""
-        return next(node.id for node in self.spec.nodes if name in node.sensors)
+        return self._sensor_nodes[name]
+
+    @cached_property
+    def _sensor_nodes(self) -> dict[str, str]:
+        return {sensor: node.id for node in self.spec.nodes for sensor in node.sensors}
 
     @property
     def declared_nodes(self) -> tuple[str, ...]:
@@ -124,7 +144,7 @@ class Layout:
     @property
     def node_pairs(self) -> set[frozenset[str]]:
         """The pairs of nodes, or node and boundary, that a declared conductor joins."""
-        return {frozenset(c.between) for c in self.spec.conductors}
+        return {frozenset(c.between) for c in self.spec.conductors if c.into is None}
 
     @property
     def surfaces(self) -> list[tuple[str, str]]:
@@ -139,13 +159,17 @@ class Layout:
 
 
 def conductor_name(between: Sequence[str]) -> str:
-    """Return the name of a declared conductance, such as ``G:px|tank``."""
+    """Return the name of a declared symmetric conductance, such as ``G:px|tank``."""
     return f"G:{between[0]}|{between[1]}"
 
 
 def gain_name(load: Load) -> str:
     """Return the name of the gain of a declared load, such as ``gain:H1|tank``."""
-    return f"gain:{load.channel}|{load.node}"
+    return f"gain:{_driven_by(load)}|{load.node}"
+
+
+def _driven_by(load: Load) -> str:
+    return load.channel if load.factor is None else f"{load.channel}*{load.factor}"
 
 
 def radiator_name(node: str, sink: str) -> str:
@@ -278,16 +302,14 @@ def build_network(
     effects = tuple(effects)
     knots = dict(table_knots or {})
     bare = Layout(spec, tuple(node.id for node in spec.nodes), tuple(spec.boundaries), knots)
-    extra = tuple(node for effect in effects for node in effect.extra_nodes(bare))
+    extra = (*heater_nodes(spec), *(node for effect in effects for node in effect.extra_nodes(bare)))
     layout = Layout(spec, bare.nodes + tuple(node.name for node in extra), bare.boundaries, knots)
     additions = [effect.addition(layout) for effect in effects]
     terms = (*declared_terms(layout), *(t for a in additions for t in a.terms))
     capacities = tuple(c for a in additions for c in a.capacities)
     readings = tuple(r for a in additions for r in a.readings)
     surroundings = tuple(sorted((b for a in additions for b in a.boundaries), key=lambda term: term.rank))
-    parameters: list[Parameter] = [
-        _quantity(f"C:{node.id}", "J/K", node.capacity_J_per_K, 1.0e4) for node in spec.nodes
-    ]
+    parameters: list[Parameter] = [_capacity(spec, node) for node in spec.nodes]
     parameters += [
         real(f"T:{name}", "K", b.guess_K, prior_std=b.spread or SINK_STD_K)
         for name, b in spec.boundaries.items()
@@ -316,31 +338,98 @@ def build_network(
     )
 
 
+def _capacity(spec: TwinSpec, node: Node) -> Parameter:
+    """Return the capacity of a declared node.
+
+    One that stores nothing gets what makes it follow its neighbours within ``ARITHMETIC_S``: the exponential integrator
+    takes such a node to its balance in any step, and nothing else of it needs another path.
+    """
+    quantity = node.capacity_J_per_K
+    if quantity is None or quantity.value != 0.0:
+        return _quantity(f"C:{node.id}", "J/K", quantity, 1.0e4)
+    cube = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * ROOM_K**3
+    joined = [guess_or(c.conductance_W_per_K, 1.0) for c in spec.conductors if node.id in c.between]
+    joined += [cube * guess_or(r.area_m2, 1e-3) for r in spec.radiation if node.id in r.between]
+    joined += [cube * r.emissivity * r.area_m2 for r in spec.radiators if r.node == node.id]
+    return positive(f"C:{node.id}", "J/K", ARITHMETIC_S * (sum(joined) or 1.0), frozen=True)
+
+
 def declared_terms(layout: Layout) -> list[Term]:
     """Return the terms of the specification."""
     spec = layout.spec
     terms: list[Term] = []
-    inner = [c for c in spec.conductors if not set(c.between) & set(layout.boundaries)]
+    inner = [c for c in spec.conductors if not set(c.between) & set(layout.boundaries) and c.into is None]
     if inner:
         pairs = tuple((layout.node(c.between[0]), layout.node(c.between[1])) for c in inner)
-        conductances = tuple(_conductance(c.between, c.conductance_W_per_K) for c in inner)
+        conductances = tuple(_conductance(c) for c in inner)
         terms.append(Conductors(pairs, conductances, len(layout.nodes)))
     for conductor in spec.conductors:
         outer = [end for end in conductor.between if end in layout.boundaries]
         if outer:
             node = next(end for end in conductor.between if end not in layout.boundaries)
-            parameter = _conductance(conductor.between, conductor.conductance_W_per_K)
-            terms.append(BoundaryConductor(layout.node(node), layout.boundary(outer[0]), (parameter,)))
+            terms.append(BoundaryConductor(layout.node(node), layout.boundary(outer[0]), (_conductance(conductor),)))
+        elif conductor.into is not None:
+            source = next(end for end in conductor.between if end != conductor.into)
+            terms.append(OneWayConductor(layout.node(conductor.into), layout.node(source), (_conductance(conductor),)))
     for radiator in spec.radiators:
         area = radiator.emissivity * radiator.area_m2
         parameter = positive(radiator_name(radiator.node, radiator.sink), "m2", area, frozen=True)
         terms.append(SinkRadiation(layout.node(radiator.node), layout.boundary(radiator.sink), (parameter,)))
+    terms += _radiation_terms(layout)
     terms += [_load_term(layout, load) for load in spec.loads]
+    terms += [_heater_term(layout, heater) for heater in spec.heaters]
     return terms
 
 
-def _conductance(between: tuple[str, str], quantity: Quantity | None) -> Parameter:
-    return _quantity(conductor_name(between), "W/K", quantity, 1.0)
+def _conductance(conductor: Conductor) -> Parameter:
+    return _quantity(conductor.name, "W/K", conductor.conductance_W_per_K, 1.0)
+
+
+def _radiation_terms(layout: Layout) -> Iterator[Term]:
+    """Yield the declared radiation: between nodes as one term, to each boundary as one of its own."""
+    sinks = set(layout.boundaries)
+    outer = [r for r in layout.spec.radiation if sinks & set(r.between)]
+    inner = [r for r in layout.spec.radiation if not sinks & set(r.between)]
+    parameters = {r.name: _quantity(r.name, "m2", r.area_m2, 1e-3) for r in layout.spec.radiation}
+    if inner:
+        pairs = tuple((layout.node(r.between[0]), layout.node(r.between[1])) for r in inner)
+        yield NodeRadiation(pairs, tuple(parameters[r.name] for r in inner), len(layout.nodes))
+    for coupling in outer:
+        node, sink = sorted(coupling.between, key=lambda end: end in layout.boundaries)
+        yield SinkRadiation(layout.node(node), layout.boundary(sink), (parameters[coupling.name],))
+
+
+def heater_nodes(spec: TwinSpec) -> tuple[ExtraNode, ...]:
+    """Return the states that remember whether the declared thermostats are on."""
+    unit = positive("", "J/K", 1.0, frozen=True)
+    return tuple(
+        ExtraNode(heater.name, replace(unit, name=f"C:{heater.name}"), heater.controlled_by)
+        for heater in spec.heaters
+        if heater.thermostat is not None
+    )
+
+
+def _heater_term(layout: Layout, heater: Heater) -> Term:
+    """Return the term of a declared heater; its temperatures are held, its power or gain are as they are declared."""
+    node, control = layout.node(heater.node), layout.node(heater.controlled_by)
+    if heater.thermostat is not None:
+        law = heater.thermostat
+        switched = (
+            _quantity(f"{heater.name}.Q", "W", law.power_W, 1.0),
+            real(f"{heater.name}.T_on", "K", law.on_K, frozen=True),
+            real(f"{heater.name}.T_off", "K", law.off_K, frozen=True),
+        )
+        memory = Memory(law.on_K, law.off_K, MEMORY_S)
+        return ThermostatHeat(node, layout.node(heater.name), APPROACH_K_PER_S, memory, switched)
+    proportional = heater.proportional
+    assert proportional is not None
+    parameters: tuple[Parameter, ...] = (
+        _quantity(f"{heater.name}.k", "W/K", proportional.gain_W_per_K, 1.0),
+        real(f"{heater.name}.T_set", "K", proportional.set_K, frozen=True),
+    )
+    if proportional.most_W is not None:
+        parameters = (*parameters, _quantity(f"{heater.name}.Q", "W", proportional.most_W, 1.0))
+    return ProportionalHeat(node, parameters, (), None if control == node else control)
 
 
 def _load_term(layout: Layout, load: Load) -> Term:
@@ -352,8 +441,19 @@ def _load_term(layout: Layout, load: Load) -> Term:
         knots = load.table.knots or layout.table_knots.get(key)
         if knots is None:
             raise ModelError(f"load '{load.channel}' on '{load.node}': the levels of its table are not known yet")
-        values = tuple(real(f"table:{load.channel}|{load.node}[{k:g}]", "W", 0.0) for k in knots)
-        return TableLoad(node, load.channel, tuple(knots), channel.levels, load.weight, load.solar, values)
+        table, told = load.table, load.table.values_W or load.table.guess_W or (0.0,) * len(knots)
+        values = tuple(
+            real(
+                f"table:{_driven_by(load)}|{load.node}[{k:g}]",
+                "W",
+                value,
+                prior_std=None if table.guess_W is None else table.spread_W or GUESS_LOG_STD * abs(value) or None,
+                frozen=table.values_W is not None,
+            )
+            for k, value in zip(knots, told, strict=True)
+        )
+        solar, weight = load.solar, load.weight
+        return TableLoad(node, load.channel, tuple(knots), channel.levels, weight, solar, values, (), load.factor)
     unknown = load.gain is not None or channel.unit != "W"
     unit = {"percent": "W/%", "W/m2": "m2"}.get(channel.unit or "", "")
     gain = (
@@ -361,4 +461,4 @@ def _load_term(layout: Layout, load: Load) -> Term:
         if unknown
         else positive(gain_name(load), unit, 1.0, frozen=True)
     )
-    return ChannelLoad(node, load.channel, load.weight, load.solar, (gain,))
+    return ChannelLoad(node, load.channel, load.weight, load.solar, (gain,), (), load.factor)

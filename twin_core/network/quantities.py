@@ -3,13 +3,19 @@
 import math
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 
 def _not_boolean(value: Any) -> Any:
     """Refuse true and false where a number is wanted: Python would take them for 1 and 0."""
     if isinstance(value, bool):
         raise ValueError("must be a number, not true or false")
+    return value
+
+
+def _zero_or_magnitude(value: float) -> float:
+    if value != 0.0 and not 1e-12 <= value <= 1e15:
+        raise ValueError("must be 0, or from 1e-12 to 1e15")
     return value
 
 
@@ -22,6 +28,10 @@ Magnitude = Annotated[
     Field(ge=1e-12, le=1e15, allow_inf_nan=False),
 ]
 """A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
+MagnitudeOrNone = Annotated[
+    float, BeforeValidator(_not_boolean), Field(ge=0, allow_inf_nan=False), AfterValidator(_zero_or_magnitude)
+]
+"""The same, or exactly nothing."""
 Temperature = Annotated[float, BeforeValidator(_not_boolean), Field(ge=0, le=5000, allow_inf_nan=False)]
 Fraction = Annotated[float, BeforeValidator(_not_boolean), Field(gt=0, le=1, allow_inf_nan=False)]
 NAME = r"^[A-Za-z_][A-Za-z0-9_.:/-]{0,127}$"
@@ -73,7 +83,28 @@ class Tied(Quantity):
     @property
     def tie(self) -> tuple[str, float] | None:
         """The name of the shared unknown and the size that multiplies it; None where it stands alone."""
-        return None
+        return self._scaled()
+
+    scale: Name | None = None
+
+    @model_validator(mode="after")
+    def _value_with_scale(self) -> Self:
+        if self.scale is not None and not self.value:
+            raise ValueError("scale names a shared factor; give the 'value' that it multiplies")
+        return self
+
+    @property
+    def unit(self) -> str:
+        """The unit of the shared unknown."""
+        return ""
+
+    @property
+    def tied_by(self) -> str:
+        """The field that names the shared unknown."""
+        return next((f for f in ("per_area", "per_mass") if getattr(self, f, None) is not None), "scale")
+
+    def _scaled(self) -> tuple[str, float] | None:
+        return None if self.scale is None or self.value is None else (self.scale, self.value)
 
     def _one_tie(self, shared: str, size: str) -> None:
         given = [name for name in (shared, size) if getattr(self, name) is not None]
@@ -97,13 +128,23 @@ class Conductance(Tied):
 
     @property
     def tie(self) -> tuple[str, float] | None:
-        """The shared coefficient and the area."""
-        return None if self.per_area is None or self.area_m2 is None else (self.per_area, self.area_m2)
+        """The shared coefficient and the area, or the shared factor and the value."""
+        return self._scaled() if self.per_area is None or self.area_m2 is None else (self.per_area, self.area_m2)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the shared unknown."""
+        return "" if self.per_area is None else "W/m2/K"
+
+
+class ExchangeArea(Tied):
+    """The R of a radiative coupling in m2, alone or times a shared factor."""
 
 
 class HeatCapacity(Tied):
-    """A capacity in J/K, alone or as a mass times a shared specific capacity in J/kg/K."""
+    """A capacity in J/K, alone or as a mass times a shared specific capacity in J/kg/K; 0 for a node that stores nothing."""
 
+    value: MagnitudeOrNone | None = None
     per_mass: Name | None = None
     mass_kg: Magnitude | None = None
 
@@ -114,8 +155,13 @@ class HeatCapacity(Tied):
 
     @property
     def tie(self) -> tuple[str, float] | None:
-        """The shared specific capacity and the mass."""
-        return None if self.per_mass is None or self.mass_kg is None else (self.per_mass, self.mass_kg)
+        """The shared specific capacity and the mass, or the shared factor and the value."""
+        return self._scaled() if self.per_mass is None or self.mass_kg is None else (self.per_mass, self.mass_kg)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the shared unknown."""
+        return "" if self.per_mass is None else "J/kg/K"
 
 
 def guess_or(quantity: Quantity | None, default: float) -> float:

@@ -5,14 +5,16 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, StrictBool, field_validator, model_validator
+from pydantic import AfterValidator, Field, StrictBool, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from twin_core.errors import TelemetryError
+from twin_core.network.formula import channels_of, parse
 from twin_core.network.orbit_block import PREFIX, OrbitBlock
 from twin_core.network.quantities import (
     TWIN_ID,
     Conductance,
+    ExchangeArea,
     Fraction,
     HeatCapacity,
     Magnitude,
@@ -22,6 +24,7 @@ from twin_core.network.quantities import (
     Quantity,
     Strict,
     Temperature,
+    Tied,
 )
 from twin_core.units import parse_instant_ns
 
@@ -116,18 +119,37 @@ class Node(Strict):
         return (self.sensor,) if isinstance(self.sensor, str) else self.sensor
 
 
+def _two_ends(value: tuple[str, str]) -> tuple[str, str]:
+    if value[0] == value[1]:
+        raise ValueError(f"joins '{value[0]}' to itself")
+    return value
+
+
+Ends2 = Annotated[tuple[Name, Name], AfterValidator(_two_ends)]
+
+
 class Conductor(Strict):
-    """A symmetric linear coupling GL (W/K) between two nodes, or a node and a boundary."""
+    """A linear coupling GL (W/K) between two nodes, or a node and a boundary.
 
-    between: tuple[Name, Name]
+    Symmetric; one with ``into`` heats or cools that end alone, as a flow does (GF) or a model that ignores what flows back.
+    """
+
+    between: Ends2
     conductance_W_per_K: Conductance | None = None
+    into: Name | None = None
 
-    @field_validator("between")
-    @classmethod
-    def _two_ends(cls, value: tuple[str, str]) -> tuple[str, str]:
-        if value[0] == value[1]:
-            raise ValueError(f"joins '{value[0]}' to itself")
-        return value
+    @model_validator(mode="after")
+    def _into_an_end(self) -> Self:
+        if self.into is not None and self.into not in self.between:
+            raise ValueError(f"into must be one of {' and '.join(self.between)} (got '{self.into}')")
+        return self
+
+    @property
+    def name(self) -> str:
+        """Its parameter's name: ``G:a|b``; ``G:b>a`` where only ``a`` feels it."""
+        if self.into is None:
+            return f"G:{self.between[0]}|{self.between[1]}"
+        return f"G:{next(end for end in self.between if end != self.into)}>{self.into}"
 
 
 class Radiator(Strict):
@@ -139,10 +161,110 @@ class Radiator(Strict):
     sink: Name
 
 
+class Radiation(Strict):
+    """A radiative coupling GR between two nodes, or a node and a boundary: sigma * R * (T_b^4 - T_a^4) into a, R in m2.
+
+    R is the area times the emissivity, or the factor that a ray tracer gives (Gebhart); unlike that of a radiator it may
+    be calibrated.
+    """
+
+    between: Ends2
+    area_m2: ExchangeArea
+
+    @property
+    def name(self) -> str:
+        """Its parameter's name, ``R:a|b``."""
+        return f"R:{self.between[0]}|{self.between[1]}"
+
+
+class Thermostat(Strict):
+    """On below one temperature, off above another, in between as it was."""
+
+    on_K: Temperature
+    off_K: Temperature
+    power_W: Quantity
+
+    @model_validator(mode="after")
+    def _band(self) -> Self:
+        if not self.on_K < self.off_K:
+            raise ValueError(f"on_K must lie below off_K ({self.on_K:g} and {self.off_K:g} given)")
+        return self
+
+
+class Proportional(Strict):
+    """Heat in proportion to how far the temperature is below a set-point, up to a power where one is given."""
+
+    set_K: Temperature
+    gain_W_per_K: Quantity
+    most_W: Quantity | None = None
+
+
+class Heater(Strict):
+    """A heater that a temperature controls: that of its own node unless ``control`` names another one."""
+
+    node: Name
+    control: Name | None = None
+    thermostat: Thermostat | None = None
+    proportional: Proportional | None = None
+
+    @model_validator(mode="after")
+    def _one_law(self) -> Self:
+        if (self.thermostat is None) == (self.proportional is None):
+            raise ValueError("give exactly one of 'thermostat' and 'proportional'")
+        return self
+
+    @property
+    def controlled_by(self) -> str:
+        """The node whose temperature switches it."""
+        return self.control or self.node
+
+    @property
+    def name(self) -> str:
+        """What prefixes its parameters' names."""
+        return f"heater:{self.node}" if self.control is None else f"heater:{self.node}<{self.control}"
+
+
+class Derived(Strict):
+    """A channel that is computed from others and from the date; heat in W where it says so, else auxiliary."""
+
+    formula: str
+    unit: Literal["W"] | None = None
+    levels: StrictBool = False
+
+    @field_validator("formula")
+    @classmethod
+    def _parses(cls, value: str) -> str:
+        parse(value)
+        return value
+
+    @model_validator(mode="after")
+    def _levels_of_no_power(self) -> Self:
+        if self.levels and self.unit is not None:
+            raise ValueError("only an auxiliary channel has levels")
+        return self
+
+
 class Table(Strict):
-    """Heat as an unknown function of an auxiliary channel: piecewise linear over knots, or one value per level."""
+    """Heat as a function of an auxiliary channel: piecewise linear over knots, or one value per level.
+
+    Unknown unless its values at the knots are given: known (``values_W``), or guessed with one standard deviation.
+    """
 
     knots: tuple[Number, ...] | None = None
+    values_W: tuple[Number, ...] | None = None
+    guess_W: tuple[Number, ...] | None = None
+    spread_W: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_value_per_knot(self) -> Self:
+        if self.values_W is not None and self.guess_W is not None:
+            raise ValueError("give either 'values_W' (known, held) or 'guess_W' (calibrated), not both")
+        if self.spread_W is not None and self.guess_W is None:
+            raise ValueError("spread_W says by how many W a guess may be off; give 'guess_W' with it")
+        given = self.values_W or self.guess_W
+        if given is not None and len(given) != len(self.knots or ()):
+            raise ValueError(f"{len(given)} values for {len(self.knots or ())} knots; give one for each")
+        return self
 
     @field_validator("knots")
     @classmethod
@@ -153,7 +275,7 @@ class Table(Strict):
 
 
 class Load(Strict):
-    """A declared heat input into one node."""
+    """A declared heat input into one node, times an auxiliary channel where ``factor`` names one."""
 
     channel: Name
     node: Name
@@ -161,6 +283,7 @@ class Load(Strict):
     gain: Quantity | None = None
     solar: StrictBool = False
     table: Table | None = None
+    factor: Name | None = None
 
 
 class Interval(Strict):
@@ -230,6 +353,9 @@ class TwinSpec(Strict):
     criteria: Criteria = Criteria()
     parameters: dict[Name, Quantity] = Field(default_factory=dict)
     orbit: OrbitBlock | None = None
+    radiation: tuple[Radiation, ...] = ()
+    heaters: tuple[Heater, ...] = ()
+    derived: dict[Name, Derived] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
@@ -259,17 +385,38 @@ class TwinSpec(Strict):
         if not seen:
             yield "nodes: none has a sensor; name the temperature channel of at least one node"
         yield from self._check_conductors(nodes)
+        yield from self._check_unseen()
         for i, radiator in enumerate(self.radiators):
             yield from self._check_end(f"radiators[{i}].node", radiator.node, nodes)
             yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
             if (radiator.node, radiator.sink) in [(r.node, r.sink) for r in self.radiators[:i]]:
                 yield f"radiators[{i}]: '{radiator.node}' radiates to '{radiator.sink}' twice; add the areas"
         yield from self._check_orbit()
+        yield from self._check_radiation(nodes)
+        yield from self._check_heaters(nodes)
+        yield from self._check_derived()
         yield from self._check_loads(nodes)
         yield from self._check_shared()
         for sensor in self.criteria.per_sensor:
             if sensor not in seen:
                 yield f"criteria.per_sensor.{sensor}: reads no node (sensors: {', '.join(seen) or 'none'})"
+
+    def _check_unseen(self) -> Iterable[str]:
+        """Refuse hidden nodes that are joined with one another and with no node that is read: no data tell anything of them.
+
+        A single one may yet be joined by what the closed loop finds; it is told among the doubts.
+        """
+        groups = {node.id: {node.id} for node in self.nodes}
+        for conductor in self.conductors:
+            one, other = (groups.get(end) for end in conductor.between)
+            if one is not None and other is not None and one is not other:
+                one |= other
+                groups |= dict.fromkeys(other, one)
+        read = {node.id for node in self.nodes if node.sensors}
+        for group in {id(group): group for group in groups.values()}.values():
+            if len(group) > 1 and not group & read:
+                names = ", ".join(sorted(group)[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
+                yield f"nodes: no sensor sees {names}: join one of them to a node with a sensor, or remove them"
 
     def _check_shared(self) -> Iterable[str]:
         """Check the shared unknowns: each is used, by quantities of one kind, and has a size to start from."""
@@ -286,22 +433,21 @@ class TwinSpec(Strict):
             if quantity.guess is None and quantity.value is None:
                 yield f"parameters.{name}: give a 'guess' that is calibrated, or a 'value' that is held"
             if name not in used:
-                yield f"parameters.{name}: is used nowhere; name it as 'per_area' or 'per_mass', or remove it"
+                yield f"parameters.{name}: is used nowhere; name it as 'per_area', 'per_mass' or 'scale', or remove it"
 
     @property
     def ties(self) -> list[tuple[str, tuple[str, float], str]]:
         """Where shared unknowns are used: field, (name, size), and the unit that this makes the unknown's."""
-        masses = [
-            (f"nodes[{i}].capacity_J_per_K.per_mass", node.capacity_J_per_K.tie, "J/kg/K")
-            for i, node in enumerate(self.nodes)
-            if node.capacity_J_per_K is not None
+        where: list[tuple[str, Tied | None]] = [
+            *((f"nodes[{i}].capacity_J_per_K.", n.capacity_J_per_K) for i, n in enumerate(self.nodes)),
+            *((f"conductors[{i}].conductance_W_per_K.", c.conductance_W_per_K) for i, c in enumerate(self.conductors)),
+            *((f"radiation[{i}].area_m2.", r.area_m2) for i, r in enumerate(self.radiation)),
         ]
-        areas = [
-            (f"conductors[{i}].conductance_W_per_K.per_area", conductor.conductance_W_per_K.tie, "W/m2/K")
-            for i, conductor in enumerate(self.conductors)
-            if conductor.conductance_W_per_K is not None
+        return [
+            (field + tied.tied_by, tied.tie, tied.unit)
+            for field, tied in where
+            if tied is not None and tied.tie is not None
         ]
-        return [(field, tie, unit) for field, tie, unit in [*masses, *areas] if tie is not None]
 
     def _check_orbit(self) -> Iterable[str]:
         for name in () if self.orbit is None else self.orbit.units:
@@ -313,7 +459,8 @@ class TwinSpec(Strict):
                 yield f"orbit.attitude.quaternion_channels: channel '{name}' has levels; a quaternion has none"
 
     def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
-        pairs: set[frozenset[str]] = set()
+        pairs: set[tuple[frozenset[str], str | None]] = set()
+        joined: set[frozenset[str]] = set()
         for i, conductor in enumerate(self.conductors):
             ends = frozenset(conductor.between)
             for end in conductor.between:
@@ -322,9 +469,48 @@ class TwinSpec(Strict):
                 )
             if ends <= set(self.boundaries):
                 yield f"conductors[{i}].between: joins two boundaries; one end must be a node"
-            if ends in pairs:
+            if conductor.into in self.boundaries:
+                yield f"conductors[{i}].into: '{conductor.into}' is a boundary, which nothing heats; name the node"
+            if (ends, conductor.into) in pairs or (
+                ((ends, None) in pairs or conductor.into is None) and ends in joined
+            ):
                 yield f"conductors[{i}].between: {' and '.join(conductor.between)} are joined twice; add the conductances"
-            pairs.add(ends)
+            pairs.add((ends, conductor.into))
+            joined.add(ends)
+
+    def _check_radiation(self, nodes: list[str]) -> Iterable[str]:
+        seen = {frozenset((r.node, r.sink)) for r in self.radiators}
+        for i, coupling in enumerate(self.radiation):
+            for end in coupling.between:
+                yield from self._check_end(
+                    f"radiation[{i}].between", end, [*nodes, *self.boundaries], "node or boundary"
+                )
+            ends = frozenset(coupling.between)
+            if ends <= set(self.boundaries):
+                yield f"radiation[{i}].between: joins two boundaries; one end must be a node"
+            if ends in seen:
+                yield f"radiation[{i}].between: {' and '.join(coupling.between)} radiate twice; add the areas"
+            seen.add(ends)
+
+    def _check_heaters(self, nodes: list[str]) -> Iterable[str]:
+        names = [heater.name for heater in self.heaters]
+        for i, heater in enumerate(self.heaters):
+            yield from self._check_end(f"heaters[{i}].node", heater.node, nodes)
+            yield from self._check_end(f"heaters[{i}].control", heater.controlled_by, nodes)
+            if heater.name in names[:i]:
+                yield f"heaters[{i}]: node '{heater.node}' has another heater with the same control; add the powers"
+
+    def _check_derived(self) -> Iterable[str]:
+        known = [*self.channels, *self.orbit_channels]
+        for name, derived in self.derived.items():
+            if name in known:
+                yield f"derived.{name}: a channel has the same name"
+            for read in channels_of(derived.formula):
+                if read not in known:
+                    yield f"derived.{name}.formula: unknown channel '{read}' (known: {', '.join(known) or 'none'})"
+                elif self.inputs[read].kind == "temperature":
+                    yield f"derived.{name}.formula: '{read}' is a temperature, which the model predicts; use other channels"
+            known.append(name)
 
     def _check_loads(self, nodes: list[str]) -> Iterable[str]:
         weights: dict[str, float] = {}
@@ -333,7 +519,9 @@ class TwinSpec(Strict):
             yield from self._check_channel(f"loads[{i}].channel", load.channel, ("power", "auxiliary"))
             if load.solar and load.channel in self.orbit_channels:
                 yield f"loads[{i}].solar: '{load.channel}' follows the Sun's distance already; leave it out"
-            if (load.channel, load.node) in [(other.channel, other.node) for other in self.loads[:i]]:
+            if load.factor is not None:
+                yield from self._check_channel(f"loads[{i}].factor", load.factor, ("auxiliary",))
+            if (load.channel, load.node, load.factor) in [(x.channel, x.node, x.factor) for x in self.loads[:i]]:
                 yield f"loads[{i}]: channel '{load.channel}' heats node '{load.node}' twice; add the weights"
             channel = self.inputs.get(load.channel)
             if channel is None or channel.kind == "temperature":
@@ -346,7 +534,7 @@ class TwinSpec(Strict):
                 yield f"loads[{i}].gain: a load with a table has no gain; its values are calibrated"
             if load.table is not None and channel.levels is False and load.table.knots is None:
                 yield f"loads[{i}].table.knots: missing; '{load.channel}' has no levels"
-            if load.table is None and load.gain is None and channel.unit == "W":
+            if load.table is None and load.gain is None and channel.unit == "W" and load.factor is None:
                 weights[load.channel] = weights.get(load.channel, 0.0) + load.weight
         for name, total in weights.items():
             if total > 1.0 + 1e-9:
@@ -384,8 +572,18 @@ class TwinSpec(Strict):
 
     @cached_property
     def inputs(self) -> Mapping[str, Channel]:
-        """Every channel by its name: those of the telemetry, and those of the orbit."""
-        return {**self.channels, **self.orbit_channels}
+        """Every channel by its name: those of the telemetry, of the orbit, and those that are computed from them."""
+        return {**self.channels, **self.orbit_channels, **self.derived_channels}
+
+    @cached_property
+    def derived_channels(self) -> Mapping[str, Channel]:
+        """What formulas give, interpolated between the ends of a step; levels and what follows held channels jump there."""
+        return {
+            name: Channel.model_construct(
+                kind="power" if d.unit == "W" else "auxiliary", unit=d.unit, levels=d.levels, interpolation="linear"
+            )
+            for name, d in self.derived.items()
+        }
 
     @property
     def attitude_channels(self) -> tuple[str, ...]:

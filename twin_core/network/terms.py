@@ -93,7 +93,8 @@ class Heat:
     heat_W : (n_points, n_local)
     d_temperature : (n_points or 1, n_local, n_local)
         d heat_W[:, a] / d temperature of nodes[b] at the same point. A heat that is shared out over both points of a step
-        (a relay) gives at each what the sum over both changes with the temperature there.
+        (a relay) gives at each what the sum over both changes with the temperature there. Of size 0 for many nodes
+        at once, where ``fourth_W_per_K4`` tells all.
     d_values
         Entries whose item counts the term's ``parameters`` first, then what it ``borrows``.
     d_boundaries
@@ -332,8 +333,82 @@ class SinkRadiation:
 
 
 @dataclass(frozen=True)
+class OneWayConductor:
+    """A conductor that only one node feels: q = G (T_source - T); the source gives nothing."""
+
+    node: int
+    source: int
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the conductor."""
+        difference = along.temperatures_K[:, self.source] - along.temperatures_K[:, self.node]
+        heat = np.stack([values[0] * difference, np.zeros_like(difference)], axis=1)
+        slope = values[0] * np.array([[[-1.0, 1.0], [0.0, 0.0]]])
+        return Heat((self.node, self.source), heat, slope, [Entry(0, self.node, difference)])
+
+
+@dataclass(frozen=True)
+class NodeRadiation:
+    """All declared radiation between nodes at once: q_a = -q_b = sigma R (T_b^4 - T_a^4)."""
+
+    pairs: tuple[tuple[int, int], ...]
+    parameters: tuple[Parameter, ...]
+    n_nodes: int
+    borrows: tuple[str, ...] = ()
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate every coupling: a weighted graph Laplacian on T^4; what one node gains the others lose."""
+        first, second = np.array(self.pairs).T
+        laplacian = np.zeros((self.n_nodes, self.n_nodes))
+        np.add.at(laplacian, (first, second), -STEFAN_BOLTZMANN_W_PER_M2_K4 * values)
+        laplacian += laplacian.T
+        np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
+        square = along.temperatures_K * along.temperatures_K
+        fourth = square * square
+        heat = (fourth[:, :1] - fourth) @ laplacian  # differences, so that equal temperatures exchange nothing
+        entries = []
+        for edge, (a, b) in enumerate(self.pairs if along.derivatives else ()):
+            unit = STEFAN_BOLTZMANN_W_PER_M2_K4 * (fourth[:, b] - fourth[:, a])
+            entries += [Entry(edge, a, unit), Entry(edge, b, -unit)]
+        return Heat(tuple(range(self.n_nodes)), heat, np.zeros((0, 0, 0)), entries, fourth_W_per_K4=-laplacian)
+
+
+@dataclass(frozen=True)
+class ProportionalHeat:
+    """q = min(Q, k (T_set - T)) below T_set, else 0; values are k, T_set, Q, without Q where there is no limit.
+
+    T is the temperature of ``control``, that of the heated node itself where it is None.
+    """
+
+    node: int
+    parameters: tuple[Parameter, ...]
+    borrows: tuple[str, ...] = ()
+    control: int | None = None
+
+    def evaluate(self, along: Along, values: FloatArray) -> Heat:
+        """Evaluate the heater; at k = 0 the derivative by k is that of a heater limited to Q = k (T_set - T_full)."""
+        gain, set_point = values[:2]
+        limit = values[2] if values.size > 2 else np.inf
+        control = self.node if self.control is None else self.control
+        below = np.maximum(set_point - along.temperatures_K[:, control], 0.0)
+        full = gain * below >= limit
+        heated = (below > 0.0) & ~full
+        zero = np.zeros_like(below)
+        heat, slope = np.where(full, limit, gain * below), np.where(heated, -gain, 0.0)
+        entries = [Entry(0, self.node, np.where(full, zero, below)), Entry(1, self.node, np.where(heated, gain, 0.0))]
+        if values.size > 2:
+            entries.append(Entry(2, self.node, np.where(full, 1.0, zero)))
+        if control == self.node:
+            return Heat((self.node,), heat[:, None], slope[:, None, None], entries)
+        jacobian = np.stack([np.stack([zero, slope], -1), np.stack([zero, zero], -1)], axis=-2)
+        return Heat((self.node, control), np.stack([heat, zero], axis=1), jacobian, entries)
+
+
+@dataclass(frozen=True)
 class ChannelLoad:
-    """A declared heat input: q = gain * weight * u(t), times (1 AU / Sun distance)^2 where solar."""
+    """A declared heat input: q = gain * weight * u(t), times (1 AU / Sun distance)^2 where solar, times ``factor``."""
 
     node: int
     channel: str
@@ -341,10 +416,13 @@ class ChannelLoad:
     solar: bool
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
+    factor: str | None = None
 
     def unit_heat(self, along: Along) -> FloatArray:
         """Return the heat at gain one, (n_points,)."""
         unit = self.weight * along.inputs[self.channel]
+        if self.factor is not None:
+            unit = unit * along.inputs[self.factor]
         return unit * along.sun_factor if self.solar else unit
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
@@ -365,6 +443,7 @@ class TableLoad:
     solar: bool
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
+    factor: str | None = None
 
     def basis(self, along: Along) -> FloatArray:
         """Return how much each value counts at each point, (n_points, n_values)."""
@@ -375,6 +454,8 @@ class TableLoad:
         basis = self.weight * self.basis(along)
         if self.solar:
             basis = basis * along.sun_factor[:, None]
+        if self.factor is not None:
+            basis = basis * along.inputs[self.factor][:, None]
         entries = [Entry(i, self.node, basis[:, i]) for i in range(len(self.parameters))]
         return Heat((self.node,), (basis @ values)[:, None], np.zeros((1, 1, 1)), entries)
 

@@ -19,10 +19,11 @@ class ParameterSet:
 
     def __post_init__(self) -> None:
         """Refuse two parameters of one name."""
-        names = [p.name for p in self.parameters]
-        for i, name in enumerate(names):
-            if name in names[:i]:
-                raise ModelError(f"parameter '{name}' stands twice in the model")
+        seen: set[str] = set()
+        for parameter in self.parameters:
+            if parameter.name in seen:
+                raise ModelError(f"parameter '{parameter.name}' stands twice in the model")
+            seen.add(parameter.name)
 
     def __len__(self) -> int:
         return len(self.parameters)

@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import TelemetryError
+from twin_core.network.formula import channels_of, evaluate, is_dated
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.terms import Along
@@ -142,6 +143,7 @@ def build_forcing(network: Network, record: Record, max_step_s: float) -> Forcin
         name: at_times(record, name, spec.channels[name].is_held, stage_time, interval=stage_interval)
         for name in _driving_channels(spec, record)
     } | orbit_inputs(spec, record, begin, step, ENDS)
+    inputs |= _derived(spec, record, inputs, stage_time)
     sample_step = np.concatenate([[0], np.cumsum(divisions)])
     sun = _sun_factor(spec, record, stage_time)
     start = float(record.time_s[0])
@@ -160,13 +162,30 @@ def _check_clock(network: Network, record: Record) -> None:
 
 def _driving_channels(spec: TwinSpec, record: Record) -> tuple[str, ...]:
     """Return the channels of declared loads, and every further power or auxiliary channel that the record has."""
-    declared = {load.channel for load in spec.loads} - spec.orbit_channels.keys()
+    declared = {load.channel for load in spec.loads} | {load.factor for load in spec.loads if load.factor is not None}
+    declared |= {name for derived in spec.derived.values() for name in channels_of(derived.formula)}
+    declared -= spec.orbit_channels.keys() | spec.derived.keys()
     free = {
         name
         for name, channel in spec.channels.items()
         if channel.kind != "temperature" and name in record.values and np.isfinite(record.values[name]).any()
     }
     return tuple(name for name in spec.channels if name in declared | free)
+
+
+def _derived(
+    spec: TwinSpec, record: Record, inputs: Mapping[str, FloatArray], time_s: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what formulas give at both ends of steps; each may read those before it."""
+    found: dict[str, FloatArray] = {}
+    for name, derived in spec.derived.items():
+        if is_dated(derived.formula) and record.epoch_ns is None:
+            raise TelemetryError(f"{record.name}: derived.{name} needs dates; give a 'time' column in RFC 3339")
+        found[name] = evaluate(derived.formula, {**inputs, **found}, time_s + record.epoch_s)
+        if not np.isfinite(found[name]).all():
+            at = record.present(float(time_s[~np.isfinite(found[name])][0]))
+            raise TelemetryError(f"{record.name}: derived.{name} is not finite at {at}; correct its formula")
+    return found
 
 
 def _sun_factor(spec: TwinSpec, record: Record, time_s: FloatArray) -> FloatArray:

@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.constants import ZERO_CELSIUS_K
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4, ZERO_CELSIUS_K
 from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
 from twin_core.network.jacobian import Jacobian
 from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.network.surroundings import surround
-from twin_core.network.terms import Along, ChannelLoad, Conductors, Relay, TableLoad
+from twin_core.network.terms import Along, ChannelLoad, Conductors, NodeRadiation, Relay, TableLoad
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import Remainder
 from twin_core.simulate.modes import Modes
@@ -96,12 +96,13 @@ def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
         if around.by_state and any(around.by_state.get(e.item) for e in part.d_boundaries):
             others.append(position)
             continue
-        if part.fourth_W_per_K4 is None and part.d_temperature.shape[0] > 1:
+        if part.fourth_W_per_K4 is not None:
+            matrix, slope = fourth, part.fourth_W_per_K4
+        elif part.d_temperature.shape[0] == 1:
+            matrix, slope = linear, part.d_temperature[0]
+        else:
             others.append(position)
             continue
-        matrix, slope = (
-            (linear, part.d_temperature[0]) if part.fourth_W_per_K4 is None else (fourth, part.fourth_W_per_K4)
-        )
         if part.nodes == everywhere:
             matrix += slope
             heat += part.heat_W
@@ -331,6 +332,10 @@ def turning(
             if isinstance(term, Conductors):  # by far the most, and linear
                 a, b = term.pairs[item]
                 change[[a, a, b, b], [a, b, a, b]] = (-1.0, 1.0, 1.0, -1.0)
+            elif isinstance(term, NodeRadiation):
+                a, b = term.pairs[item]
+                unit = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * about_K[[a, b]] ** 3
+                change[[a, a, b, b], [a, b, a, b]] = (-unit[0], unit[1], unit[0], -unit[1])
             elif not isinstance(term, ChannelLoad | TableLoad):
                 step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
                 for sign in (1.0, -1.0):

@@ -16,8 +16,8 @@ COMMANDS = sorted(twin.commands)
 
 def test_the_commands() -> None:
     assert COMMANDS == [
-        *("calibrate", "check-effect", "close-loop", "demo", "forecast"),
-        *("record", "replay", "serve", "simulate"),
+        *("backup", "calibrate", "check-effect", "close-loop", "demo", "forecast", "import", "migrate"),
+        *("record", "register", "replay", "restore", "serve", "simulate"),
     ]
 
 

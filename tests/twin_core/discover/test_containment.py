@@ -1,5 +1,6 @@
 """A numerical failure ends one candidate, is listed with its reason, and never the search; a deadline ends it with an answer."""
 
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,7 +12,8 @@ from numpy.linalg import LinAlgError
 from benchmarks.network_cases import network_case
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover import close_loop
-from twin_core.discover.confirm import Trial
+from twin_core.discover.confirm import Trial, try_effects
+from twin_core.discover.phrasing import headline
 from twin_core.discover.search import search
 from twin_core.errors import TelemetryError
 
@@ -71,6 +73,33 @@ def test_a_deadline_is_told_in_the_report() -> None:
     report = close_loop(case.spec, [case.record], deadline_s=1e-3).report
     assert report["findings"] == []
     assert any("the deadline ended the search" in notice for notice in report["notices"])
+    assert report["search"] == {"complete": False, "left_out": report["search"]["left_out"]}
+    assert "deadline ended the search" in headline(report) and "suffices" not in headline(report)
+    assert report["witness"] == [] and any("the time is up" in notice for notice in report["notices"])
+
+
+def test_what_began_before_the_deadline_does_not_go_on_after_it(base: Trial, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock jumps past the deadline in the midst of a candidate's refit: that candidate is the last."""
+    clock, refits = [0.0], []
+    monkeypatch.setattr("twin_core.calibrate.containment.time.monotonic", lambda: clock[0])
+
+    def overtaken(*arguments: Any, **options: Any) -> Any:
+        refits.append(arguments)
+        clock[0] = 100.0
+        return try_effects(*arguments, **options)
+
+    monkeypatch.setattr("twin_core.discover.search.try_effects", overtaken)
+    found = search(base, false_alarm_rate=0.01, deadline=50.0)
+    assert found.trial is base and found.findings == [] and found.rejected == []
+    assert 1 <= len(refits) <= (os.cpu_count() or 1)  # those that ran side by side
+    assert len(found.left_out) > len(refits)
+
+
+def test_a_calibration_ends_at_the_deadline_with_what_it_has() -> None:
+    case = network_case("leak_to_boundary", 1, n_orbits=3, dt_s=300.0)
+    fit, calibration = fit_network(case.spec, [case.record], deadline=time.monotonic())
+    assert np.isfinite(fit.log_likelihood) and np.isfinite(calibration.optimum.fit.cost)
+    assert calibration.optimum.status == "deadline"
 
 
 @pytest.mark.parametrize("deadline_s", [0.0, -1.0, np.nan])

@@ -2,11 +2,18 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
+from scipy.stats import norm
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects
-from twin_core.discover.experiments import separating
+from twin_core.discover.experiments import (
+    entropy_bits,
+    information_bits,
+    keeps_limits,
+    plans,
+    separating,
+)
 from twin_core.discover.judge import Finding, Judged
 from twin_core.discover.screen import screen, survey_of
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
@@ -82,3 +89,68 @@ def test_moving_the_input_tells_more_than_the_same_again(finding: Finding) -> No
 
 def test_nothing_to_separate_without_an_alternative(finding: Finding) -> None:
     assert separating(Finding(finding.judged)) == []
+
+
+def gain_by_quadrature(means: list[float], stds: list[float], weights: list[float]) -> float:
+    """Integrate the mutual information of an option and one normal reading, in bits."""
+    laws = [norm(m, s) for m, s in zip(means, stds, strict=True)]
+
+    def mixed(y: float) -> float:
+        return sum(w * law.pdf(y) for w, law in zip(weights, laws, strict=True))
+
+    ends = (min(means) - 9.0 * max(stds), max(means) + 9.0 * max(stds))
+    marginal, _ = quad(lambda y: -mixed(y) * np.log2(max(mixed(y), 1e-300)), *ends, limit=400, points=means)
+    return marginal - sum(w * law.entropy() / np.log(2.0) for w, law in zip(weights, laws, strict=True))
+
+
+@pytest.mark.parametrize("weights", [[0.5, 0.5, 0.0], [0.8, 0.15, 0.05], [0.2, 0.3, 0.5]])
+@pytest.mark.parametrize("apart", [0.0, 0.7, 2.0, 12.0])
+def test_the_expected_gain_is_that_of_quadrature(apart: float, weights: list[float]) -> None:
+    """One direction of many readings tells: along it option k lies at k * apart, and the second is less certain of it."""
+    along = np.array([0.6, 0.0, 0.8])
+    spreads = [0.0, 1.5, 0.0]
+    predicted = [(10.0 + k * apart * along, s * along[:, None]) for k, s in enumerate(spreads)]
+    stds = [float(np.hypot(1.0, s)) for s in spreads]
+    expected = gain_by_quadrature([k * apart for k in range(3)], stds, weights)
+    found = information_bits(predicted, np.array(weights), n_draws=20_000)
+    assert found == pytest.approx(expected, abs=0.02)
+    assert found <= entropy_bits(np.array(weights)) + 1e-12
+
+
+def test_a_difference_that_parameters_can_take_up_tells_nothing() -> None:
+    direction = np.linspace(0.0, 30.0, 50)
+    certain = np.zeros((50, 1))
+    vague = 10.0 * direction[:, None]
+    told = information_bits([(np.zeros(50), certain), (direction, certain)], np.array([0.5, 0.5]))
+    taken_up = information_bits([(np.zeros(50), vague), (direction, vague)], np.array([0.5, 0.5]))
+    assert told == pytest.approx(1.0, abs=0.01)
+    assert taken_up < 0.02
+
+
+def test_the_best_experiment_gains_most_and_no_more_than_there_is(finding: Finding) -> None:
+    found = separating(finding)
+    gains = [experiment.gain_bits for experiment in found]
+    assert gains == sorted(gains, reverse=True) and gains[0] > 0.9
+    assert {experiment.entropy_bits for experiment in found} == {1.0}
+    assert found[0].row()["plan"]["channel"] == "Q"
+
+
+def test_inputs_keep_to_their_limits_and_sunlight_is_not_moved() -> None:
+    channels = SPEC.model_dump(exclude_none=True)["channels"] | {"S": {"kind": "power", "unit": "W"}}
+    channels["Q"]["limits"] = {"red": [0.0, 60.0], "yellow": [5.0, None]}
+    loads = [{"channel": "Q", "node": "a"}, {"channel": "S", "node": "a", "solar": True}]
+    spec = TwinSpec.model_validate(SPEC.model_dump(exclude_none=True) | {"channels": channels, "loads": loads})
+    record = Record(TIMES, {"T_a": np.full(200, 280.0), "Q": np.full(200, 40.0), "S": np.arange(200.0)})
+    values = {(plan.channel, plan.value) for plan in plans(spec, record)}
+    assert values == {(None, None), ("Q", 5.0), ("Q", 60.0)}
+
+
+def test_no_option_may_leave_the_limits_of_a_temperature() -> None:
+    channels = SPEC.model_dump(exclude_none=True)["channels"]
+    channels["T_a"] |= {"unit": "degC", "limits": {"yellow": [-5.0, None], "red": [-20.0, 40.0]}}
+    spec = TwinSpec.model_validate(SPEC.model_dump(exclude_none=True) | {"channels": channels})
+    inside = np.array([[268.2], [313.1]])
+    assert keeps_limits(spec, inside)
+    assert not any(keeps_limits(spec, inside + by) for by in (-0.1, 0.1))
+    assert not keeps_limits(spec, np.array([[np.nan]]))
+    assert keeps_limits(SPEC, np.array([[1000.0]]))

@@ -8,9 +8,9 @@ from scipy.integrate import solve_ivp
 import twin_core.simulate.rollout as rollout_module
 from tests.helpers import at_named, conductive_spec, every_term_network, points, record_of, survey_of
 from twin_core.effects import REGISTRY
-from twin_core.effects.thermostat_heater import switching
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec_io import load_spec
+from twin_core.network.thermostat import switching
 from twin_core.simulate.forcing import Forcing, build_forcing
 from twin_core.simulate.response import sensitivities
 

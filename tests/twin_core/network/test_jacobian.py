@@ -15,8 +15,8 @@ def test_the_parts_add_up_to_the_dense_sum(n_points: int) -> None:
     slope[:, 1] = rng.uniform(0.1, 2.0, n_points)
     own = np.array([2.0, 3.0, 5.0])
     total = JacobianSum(3)
-    total.add(Heat((0, 1, 2), np.zeros((n_points, 3)), fixed))
-    total.add(Heat((2, 0), np.zeros((n_points, 2)), local))
+    total.add(Heat((0, 1, 2), np.zeros((n_points, 3)), fixed), np.ones((n_points, 3)))
+    total.add(Heat((2, 0), np.zeros((n_points, 2)), local), np.ones((n_points, 3)))
     found = total.over(own, n_points).with_columns_scaled([1], slope)
     expected = np.repeat(fixed, n_points, axis=0)
     for point in range(n_points):

@@ -140,3 +140,16 @@ def test_solar_is_true_or_false(pair: dict[str, Any]) -> None:
     pair["loads"] = [{"channel": "Q_sun", "node": pair["nodes"][0]["id"], "solar": "yes"}]
     with pytest.raises(SpecError, match=r"loads\[0\]\.solar"):
         load_spec(pair)
+
+
+def test_hidden_nodes_that_no_sensor_sees_are_refused() -> None:
+    spec = {
+        "twin": "ring",
+        "channels": {"T": {"kind": "temperature", "unit": "K"}},
+        "nodes": [{"id": "seen", "sensor": "T"}, {"id": "a"}, {"id": "b"}, {"id": "c"}],
+        "conductors": [{"between": pair} for pair in (["a", "b"], ["b", "c"], ["c", "a"])],
+    }
+    with pytest.raises(SpecError, match="nodes: no sensor sees a, b, c: join one of them"):
+        load_spec(spec)
+    spec["conductors"] = [*spec["conductors"], {"between": ["seen", "c"]}]  # type: ignore[misc]
+    assert len(load_spec(spec).nodes) == 4

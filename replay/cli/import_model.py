@@ -1,0 +1,151 @@
+"""``twin import``: a model of another tool as a specification."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from replay.cli.command import FILE, Command
+
+if TYPE_CHECKING:
+    from twin_core.interchange.imported import Imported
+
+FORMATS = ("xija", "esatan", "sinda")
+
+
+@click.command(
+    "import",
+    cls=Command,
+    short_help="Turn a model of another tool into a specification.",
+    example="twin import psmc_spec.json --channel 1pdeaat=T_box --hidden pin1at --out psmc.yaml",
+)
+@click.argument("files", metavar="FILE...", nargs=-1, required=True, type=FILE)
+@click.option("--out", required=True, type=FILE, help="Specification to write, .yaml or .json.")
+@click.option(
+    "--format",
+    "kind",
+    type=click.Choice(FORMATS),
+    help="What the file is.  [default: told by its name and content]",
+)
+@click.option(
+    "--channel",
+    "channels",
+    multiple=True,
+    metavar="NAME=COLUMN",
+    help="Telemetry column of a component or node of the model.",
+)
+@click.option(
+    "--constant", "constants", multiple=True, metavar="NAME=VALUE", help="Input that never changes (Xija models)."
+)
+@click.option("--hidden", multiple=True, metavar="NODE", help="Nodes without telemetry (Xija models).")
+@click.option("--held", is_flag=True, help="Take every number as known; else what was fitted before is a guess.")
+@click.option("--skip-unknown", is_flag=True, help="Write what was understood, and list what was not.")
+@click.option("--json", "as_json", is_flag=True, help="Print notes and refusals as JSON.")
+def import_model(
+    files: tuple[Path, ...],
+    out: Path,
+    kind: str | None,
+    channels: tuple[str, ...],
+    constants: tuple[str, ...],
+    hidden: tuple[str, ...],
+    held: bool,
+    skip_unknown: bool,
+    as_json: bool,
+) -> None:
+    """Turn a Xija, ESATAN-TMS or SINDA/Thermal Desktop model into a specification.
+
+    Whatever is not understood is one line that names the file and the line, and then nothing is written, but with
+    --skip-unknown.
+    """
+    from replay.cli.console import notify, print_line, to_json
+    from twin_core.errors import SpecError
+    from twin_core.network.spec_io import load_spec
+
+    if out.suffix not in (".yaml", ".yml", ".json"):
+        raise click.UsageError(f"--out {out} must end in .yaml or .json")
+    texts = {file: _text(file) for file in files}
+    kind = kind or _told(files[0], texts[files[0]])
+    if kind != "sinda" and len(files) > 1:
+        raise click.UsageError(f"{files[1]}: only a SINDA deck has several files")
+    columns, values = _pairs(channels, "channel"), _pairs(constants, "constant")
+    found = _read(kind, texts, columns, values, hidden, held)
+    refused = list(found.refused)
+    if refused and not skip_unknown:
+        raise SpecError(
+            f"{refused[0]}; {len(refused)} thing(s) were not understood: leave them out with --skip-unknown", refused
+        )
+    spec = load_spec(found.data)
+    _write(out, found)
+    told = {"notes": list(found.notes), "left_out": refused}
+    if as_json:
+        print_line(to_json({"twin": spec.twin, "nodes": len(spec.nodes), **told}).rstrip())
+        return
+    notify([*found.notes, *(f"left out: {line}" for line in refused)])
+    couplings = len(spec.conductors) + len(spec.radiators) + len(spec.radiation)
+    print_line(f"wrote {out}: {len(spec.nodes)} nodes, {couplings} couplings, {len(spec.loads)} loads")
+
+
+def _text(file: Path) -> str:
+    from twin_core.errors import SpecError
+
+    try:
+        return file.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise SpecError(f"{file}: cannot be read ({error.strerror or error})") from error
+
+
+def _told(file: Path, text: str) -> str:
+    """Return what a file is."""
+    if file.suffix == ".json":
+        return "xija"
+    return "esatan" if "$MODEL" in text[:100_000].upper() else "sinda"
+
+
+def _pairs(given: tuple[str, ...], option: str) -> dict[str, str]:
+    for pair in given:
+        if "=" not in pair:
+            raise click.UsageError(f"--{option} {pair}: write it as NAME=...")
+    return {pair.split("=", 1)[0]: pair.split("=", 1)[1] for pair in given}
+
+
+def _read(
+    kind: str,
+    texts: dict[Path, str],
+    channels: dict[str, str],
+    constants: dict[str, str],
+    hidden: tuple[str, ...],
+    held: bool,
+) -> "Imported":
+    file, text = next(iter(texts.items()))
+    if kind == "xija":
+        from twin_core.interchange.xija import read_xija
+
+        try:
+            values = {name: float(value) for name, value in constants.items()}
+        except ValueError as error:
+            raise click.UsageError(f"--constant: {error}") from error
+        return read_xija(text, str(file), channels=channels, constants=values, hidden=hidden, held=held)
+    if constants or hidden:
+        raise click.UsageError("--constant and --hidden belong to Xija models")
+    if kind == "esatan":
+        from twin_core.interchange.esatan import read_esatan
+
+        return read_esatan(text, str(file), channels=channels, held=held)
+    from twin_core.interchange.sinda import read_sinda
+
+    return read_sinda({str(name): deck for name, deck in texts.items()}, channels=channels, held=held)
+
+
+def _write(out: Path, found: "Imported") -> None:
+    import yaml
+
+    from replay.cli.console import to_json
+    from twin_core.files import write_text
+
+    if out.suffix == ".json":
+        write_text(out, to_json(found.data))
+        return
+    head = "".join(f"# {line}\n" for line in (*found.notes, *(f"left out: {line}" for line in found.refused)))
+    write_text(
+        out, head + yaml.safe_dump(found.data, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110)
+    )

@@ -1,0 +1,145 @@
+"""A network of another tool as it is read, node by node and coupling by coupling, and its specification."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from twin_core._typing import Json
+from twin_core.constants import ZERO_CELSIUS_K
+from twin_core.errors import SpecError
+from twin_core.interchange.imported import Imported, number
+
+SMALLEST = 1e-12
+"""A coupling that is smaller carries nothing; the specification knows none."""
+
+GIVEN = "given_heat"
+"""The derived channel of 1 W that constant heats are multiples of."""
+
+
+@dataclass
+class Deck:
+    """What a deck says, in SI.
+
+    Attributes
+    ----------
+    name
+        Of the model.
+    capacities
+        Node -> J/K; 0 for an arithmetic one.
+    boundaries
+        Node -> K.
+    start_K
+        Node -> its temperature in the deck.
+    linear, radiative
+        (node, node) -> W/K, m2; parallel ones are added up.
+    one_way
+        (from, to) -> W/K.
+    heats_W
+        Cause -> node -> W; what is negative cools.
+    labels
+        Node -> what the deck calls it.
+    notes, refused
+        As of ``Imported``.
+    """
+
+    name: str
+    capacities: dict[str, float] = field(default_factory=dict)
+    boundaries: dict[str, float] = field(default_factory=dict)
+    start_K: dict[str, float] = field(default_factory=dict)
+    linear: dict[tuple[str, str], float] = field(default_factory=dict)
+    radiative: dict[tuple[str, str], float] = field(default_factory=dict)
+    one_way: dict[tuple[str, str], float] = field(default_factory=dict)
+    heats_W: dict[str, dict[str, float]] = field(default_factory=dict)
+    labels: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    refused: list[str] = field(default_factory=list)
+    parallel: int = 0
+
+    def knows(self, node: str) -> bool:
+        """Return whether there is such a node."""
+        return node in self.capacities or node in self.boundaries
+
+    def join(self, into: dict[tuple[str, str], float], first: str, second: str, value: float) -> None:
+        """Add a symmetric coupling to those that are there."""
+        pair = (first, second) if (second, first) not in into else (second, first)
+        self.parallel += pair in into
+        into[pair] = into.get(pair, 0.0) + value
+
+    def heat(self, cause: str, node: str, value_W: float) -> None:
+        """Add a heat to those that are there."""
+        own = self.heats_W.setdefault(cause, {})
+        own[node] = own.get(node, 0.0) + value_W
+
+
+def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: str) -> Imported:
+    """Return the specification of a deck.
+
+    Parameters
+    ----------
+    deck
+        What was read.
+    channels
+        Node -> the column of the telemetry that reads it; every node has one of its own where this is empty.
+    held
+        Take couplings and capacities as known; else couplings are guesses.
+    source
+        The deck's file, for messages.
+    """
+    for node in channels:
+        if node not in deck.capacities:
+            raise SpecError(f"{source}: has no node '{node}' that a sensor could read")
+    notes = list(deck.notes)
+    read = dict(channels)
+    if not read:
+        read = {node: f"T_{node}" for node, capacity in deck.capacities.items() if capacity > 0.0}
+        notes.append(f"{source}: every node got a channel 'T_<node>'; name those that telemetry reads with --channel")
+    if deck.parallel:
+        notes.append(f"{source}: {deck.parallel} couplings lie parallel to others and were added to them")
+    dropped = [f"{a} - {b}" for c in (deck.linear, deck.radiative) for (a, b), v in c.items() if 0.0 <= v < SMALLEST]
+    if dropped:
+        notes.append(f"{source}: {len(dropped)} couplings are below {SMALLEST:g} and left out ({dropped[0]}, ...)")
+    key = "value" if held else "guess"
+
+    def couplings(table: Mapping[tuple[str, str], float], what: str) -> list[Json]:
+        outer = set(deck.boundaries)
+        return [
+            {"between": list(pair), what: {key: number(value)}}
+            for pair, value in table.items()
+            if value >= SMALLEST and not set(pair) <= outer
+        ]
+
+    document: Json = {"twin": deck.name}
+    document["boundaries"] = {name: {"value_K": number(value)} for name, value in deck.boundaries.items()}
+    document["channels"] = {column: {"kind": "temperature", "unit": "degC"} for column in read.values()}
+    derived, loads = _loads(deck)
+    document["derived"] = derived
+    document["nodes"] = [
+        {"id": node, "capacity_J_per_K": {"value": number(capacity)}} | ({"sensor": read[node]} if node in read else {})
+        for node, capacity in deck.capacities.items()
+    ]
+    one_way = couplings(deck.one_way, "conductance_W_per_K")
+    document["conductors"] = couplings(deck.linear, "conductance_W_per_K") + [
+        {**entry, "into": entry["between"][1]} for entry in one_way
+    ]
+    document["radiation"] = couplings(deck.radiative, "area_m2")
+    document["loads"] = loads
+    return Imported({k: v for k, v in document.items() if v}, tuple(notes), tuple(deck.refused), dict(deck.start_K))
+
+
+def _loads(deck: Deck) -> tuple[Json, list[Json]]:
+    """Return one derived channel of 1 W, or -1 W, for each cause, and the loads that are multiples of it."""
+    derived: Json = {}
+    loads: list[Json] = []
+    for cause, heats in deck.heats_W.items():
+        for sign, suffix in ((1.0, ""), (-1.0, "_cooling")):
+            found = {node: abs(q) for node, q in heats.items() if sign * q >= SMALLEST and node in deck.capacities}
+            if found:
+                derived[cause + suffix] = {"formula": repr(sign), "unit": "W"}
+            loads += [
+                {"channel": cause + suffix, "node": node, "gain": {"value": number(q)}} for node, q in found.items()
+            ]
+    return derived, loads
+
+
+def kelvin(celsius: float) -> float:
+    """Return a temperature in K; what lies a little below absolute zero, as decks write deep space, is 0."""
+    return max(celsius + ZERO_CELSIUS_K, 0.0)
