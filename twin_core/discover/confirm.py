@@ -14,7 +14,7 @@ from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration, from_heat_fit
+from twin_core.calibrate.second_order import COMPARABLE, Calibration, from_heat_fit, sampling_step_s
 from twin_core.discover.once import once
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
@@ -33,6 +33,10 @@ MOST_FOLDS = 4
 
 BETWEEN_SESSIONS = 0.5
 """Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to."""
+
+LARGEST_NOISE = 1.5
+"""How much larger than calibration took it to be a sensor's noise may be: from few differences of readings it is known to a
+third."""
 
 LN_2 = float(np.log(2.0))
 
@@ -70,7 +74,8 @@ class Trial:
         near = list(self.near)
         if self.simpler is not None:
             values = self.fit.network.parameters.as_dict()
-            near.append(minimise(self.fit.problem, carried_over(self.simpler.calibration(), self.fit.problem, values)))
+            start = carried_over(self.simpler.calibration(), self.fit.problem, values)
+            near.append(minimise(self.fit.problem, start, tolerance=COMPARABLE))
         return from_heat_fit(self.fit, self.max_step_s, near=near)
 
     @property
@@ -111,10 +116,14 @@ class Trial:
 
     @once
     def excess(self) -> FloatArray:
-        """Variance of each sensor's open-loop residuals beyond its own noise, in units of that noise, (n_sensors,)."""
+        """Variance of each sensor's open-loop residuals beyond its own noise, in units of that noise, (n_sensors,).
+
+        Noise is what one sample does not tell of the next; more than ``LARGEST_NOISE`` of what calibration took for it is misfit.
+        """
         calibration = self.calibration()
-        white = np.array([model.sigma_white for model in calibration.whitener.models])
-        noise = np.maximum(np.minimum(white, calibration.problem.noise_K), 1e-300)
+        interval_s = sampling_step_s([segment.record for segment in calibration.problem.segments])
+        own = np.array([model.unforeseen(interval_s) for model in calibration.whitener.models])
+        noise = np.maximum(np.minimum(own, LARGEST_NOISE * calibration.problem.noise_K), 1e-300)
         square = np.nanmean((np.concatenate(calibration.residuals) / noise) ** 2, axis=0)
         return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
 
@@ -261,7 +270,7 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
     """
     problem = extended(base.fit.problem, effects)
     own = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(base.calibration(), problem, own))
+    optimum = minimise(problem, carried_over(base.calibration(), problem, own), tolerance=COMPARABLE)
     if optimum.status == "no_solution":
         return None
     fit = about_trajectory(problem, optimum)
