@@ -120,9 +120,12 @@ class Search:
         self.n_named = max(self.n_named, fork.n_named)
 
     def attempt(self, work: Callable[[], T], what: str) -> T | None:
-        """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``."""
+        """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``.
+
+        A candidate whose values run away is as unlikely as can be: NumPy's warnings on the way are nobody's business.
+        """
         try:
-            with limited(self.deadline):
+            with limited(self.deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 check_time()
                 return attempted(work, what, self.failures)
         except TimeIsUpError:

@@ -17,6 +17,7 @@ from twin_core.calibrate.second_order import fit_network, polished, to_model
 from twin_core.discover.confirm import Trial, fitted_effects
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
+from twin_core.discover.mistakes import told_mistakes
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
@@ -32,7 +33,7 @@ AFTERWARDS = 0.1
 """Share of the deadline that the witness may take beyond it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ClosedLoop:
     """What a closed loop leaves: the report, the corrected model, the declared one, and what the page plots."""
 
@@ -40,6 +41,15 @@ class ClosedLoop:
     model: CalibratedModel
     before_model: CalibratedModel
     plots: Json
+
+    def __repr__(self) -> str:
+        """Tell what came of it in one line."""
+        found = ", ".join(finding["effect"] for finding in self.report["findings"]) or "nothing"
+        before, after = self.report["before"]["rmse_K"], self.report["after"]["rmse_K"]
+        twin, verdict = self.report["twin"], self.report["verdict"]
+        return (
+            f"<ClosedLoop {twin}: {verdict}, {found} added; held-out rmse {before:.3g} K before, {after:.3g} K after>"
+        )
 
 
 def close_loop(
@@ -132,6 +142,7 @@ def _close_loop(
     progress(0.93, "drawing")
     witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)
+    report |= told_mistakes(found, report, deadline=latest)
     plots = build_plots(found, before, after, held, predictions, report, witness)
     report["quality"] = quality_json([*records, *holdout_records])
     plots["quality_strip"] = quality_strip([*records, *holdout_records])
@@ -186,6 +197,16 @@ def _split(
         raise TelemetryError(
             f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
         )
+    given = {b.channel for b in spec.boundaries.values() if b.channel is not None} | {
+        load.channel for load in spec.loads
+    }
+    for part in (part for h in held for part in (h.lead, h.scored)):
+        for name in sorted(given & part.values.keys()):
+            if not np.isfinite(part.values[name]).any():
+                raise TelemetryError(
+                    f"{part.name}: channel '{name}' has no samples in the hold-out, and the model needs it as an input;"
+                    " choose another hold-out, or give them"
+                )
     return train, held
 
 
