@@ -26,13 +26,13 @@ def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE
     deadline
         On the clock of ``time.monotonic``: no mistake is tried afterwards.
     """
-    calibration = search.trial.calibration
-    parameters, guesses = calibration.network.parameters, stated_guesses(search.base.calibration.problem.network)
+    calibration = search.trial.calibration()
+    parameters, guesses = calibration.network.parameters, stated_guesses(search.base.calibration().problem.network)
     squares = np.concatenate(calibration.residuals) ** 2 / calibration.problem.noise_K**2
     misfit = float(np.sqrt(np.nanmean(squares)))
     if not is_odd(parameters, guesses, misfit):
         return {"suspicions": []}
-    base = search.base.calibration
+    base = search.base.calibration()
     some, complete = suspicions(
         declared_of(base.problem),
         base.network.parameters.as_dict(),
