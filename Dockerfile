@@ -13,9 +13,10 @@ RUN pip install --index-url "$TORCH_INDEX" --extra-index-url https://pypi.org/si
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./
 COPY twin_core twin_core
+COPY thermal_twin thermal_twin
 COPY service service
 COPY replay replay
-RUN pip install . && python -m compileall -q /opt/twin
+RUN pip install ".[neural]" && python -m compileall -q /opt/twin
 
 FROM python:3.11-slim
 RUN useradd --system --uid 10001 --home-dir /data --shell /usr/sbin/nologin twin \

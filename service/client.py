@@ -147,7 +147,7 @@ class TwinClient:
         except httpx.TransportError:
             return False
 
-    def twins(self) -> list[schemas.TwinInfo]:
+    def twins(self) -> list[schemas.TwinGlance]:
         """Return every registered twin."""
         return self.send(calls.twins()).twins
 

@@ -132,10 +132,19 @@ class RevisionList(_Answer):
     revisions: list[Revision]
 
 
+class TwinGlance(TwinInfo):
+    """A twin at a glance: what is open, and whether its sensors are heard: live, delayed, stale (all silent), partly or never."""
+
+    open_anomalies: int = 0
+    yellow: int = 0
+    red: int = 0
+    state: Literal["live", "delayed", "stale", "partly", "never"] = "never"
+
+
 class TwinList(_Answer):
     """Every registered twin."""
 
-    twins: list[TwinInfo]
+    twins: list[TwinGlance]
 
 
 class Rejection(_Answer):
@@ -488,6 +497,9 @@ class Residuals(_Answer):
     model_version: list[int]
     masked: dict[str, list[MaskedSpan]] | None = Field(
         default=None, description="Spans of each sensor that are no readings; null where the answer is too long to say."
+    )
+    predicted: dict[str, list[float | None]] | None = Field(
+        default=None, description="In the channels' units, if asked for and the answer is not too long."
     )
     downsampled: bool = False
 

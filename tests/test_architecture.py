@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parent.parent
-PACKAGES = ("twin_core", "service", "replay")
+PACKAGES = ("thermal_twin", "twin_core", "service", "replay")
 
 ROOMS = (
     *("constants", "errors", "_typing", "units", "files", "csv_table"),
@@ -82,6 +82,10 @@ def test_packages_point_one_way(module: str) -> None:
         package = target.split(".")[0]
         if module.startswith("twin_core"):
             assert package not in ("service", "replay", "fastapi", "starlette", "httpx", "mcap", "uvicorn"), target
+        if module.startswith("thermal_twin"):
+            assert package not in ("service", "replay"), f"{module} imports {target}"
+        elif package == "thermal_twin":
+            raise AssertionError(f"{module} imports {target}: the facade stands on all, nothing on it")
         if module.startswith("service"):
             assert package != "replay", f"{module} imports {target}"
         if module.startswith("replay") and not module.startswith("replay.cli"):

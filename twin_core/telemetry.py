@@ -39,7 +39,7 @@ class Flaw:
     samples: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Record:
     """One segment of telemetry.
 
@@ -81,6 +81,11 @@ class Record:
                 raise TelemetryError(
                     f"{self.name}: channel '{channel}' has {column.size} samples, time has {steps.size + 1}"
                 )
+
+    def __repr__(self) -> str:
+        """Tell what it holds in one line."""
+        span = f"{self.present(self.time_s[0])} to {self.present(self.time_s[-1])}"
+        return f"<Record {self.name}: {self.time_s.size} samples of {', '.join(self.values)}; {span}>"
 
     def channel(self, name: str) -> FloatArray:
         """Return one channel, (n_times,); TelemetryError if the record lacks it."""

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.durations import DURATION
 from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
@@ -37,7 +38,9 @@ VERDICTS = {
 @click.option(
     "--holdout-telemetry", multiple=True, metavar="FILE...", type=FILE, help="Separate files kept back instead."
 )
-@click.option("--burn-in", type=float, help="First seconds of each hold-out file that tell its initial state.")
+@click.option(
+    "--burn-in", type=DURATION, help="First seconds (or 6h, 1d) of each hold-out file that tell its initial state."
+)
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
 @click.option(
     "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.durations import DURATION
 from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
@@ -19,14 +20,16 @@ _OUT = (".csv", ".json")
 @click.command(
     cls=Command,
     short_help="Forecast temperatures with quantiles.",
-    example="twin forecast --model model.json --telemetry today.csv --horizon 86400 --out tomorrow.csv",
+    example="twin forecast --model model.json --telemetry today.csv --horizon 1d --out tomorrow.csv",
 )
 @click.option("--model", "model_file", required=True, type=FILE, help="Model of twin calibrate or twin close-loop.")
 @click.option(
     "--telemetry", required=True, multiple=True, metavar="FILE", type=FILE, help="CSV or MCAP file up to now."
 )
-@click.option("--horizon", required=True, type=float, help="Seconds to look ahead.")
-@click.option("--step", type=float, help="Seconds between forecasts.  [default: as the telemetry is sampled]")
+@click.option("--horizon", required=True, type=DURATION, help="How far to look ahead: seconds, or 6h, 1d.")
+@click.option(
+    "--step", type=DURATION, help="Time between forecasts: seconds, or 10min.  [default: as the telemetry is sampled]"
+)
 @click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP.")
 @click.option(
     "--inputs",

@@ -16,6 +16,7 @@ from replay.cli.demo import demo
 from replay.cli.forecast import forecast
 from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, restore
+from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
 from replay.cli.record import record
 from replay.cli.register import register
@@ -42,6 +43,7 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
+    *(init, check, show),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
     *(backup, restore, migrate),
 ):

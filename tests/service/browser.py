@@ -126,8 +126,15 @@ class Browser:
         """Click in the middle of an element with a real mouse event."""
         found = f"document.querySelector({json.dumps(selector)})"
         self.until(found)
-        self.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
-        x, y, width, height = self.box(selector)
+        place = None
+        for _ in range(50):  # until it rests: what is loaded above it may move it
+            self.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
+            before, place = place, self.box(selector)
+            if before == place:
+                break
+            time.sleep(0.1)
+        assert place is not None
+        x, y, width, height = place
         for kind in ("mousePressed", "mouseReleased"):
             self.mouse(kind, x + width / 2, y + height / 2, button="left", clickCount=1)
 

@@ -73,6 +73,12 @@ def test_a_day_at_the_console(server: Server, page: Browser) -> None:
     page.until("!document.getElementById('report-dialog').open")
 
     page.click("#models tbody tr:first-child button")
+    page.until("document.getElementById('activate-dialog').open")
+    assert "Effects" in page.text("#compare") and "constant heat load" in page.text("#compare")
+    page.click("#activate-dialog button[value='']")
+    page.until("!document.getElementById('activate-dialog').open")
+    page.click("#models tbody tr:first-child button")
+    page.click("#activate-yes")
     page.until("document.querySelector('#models tbody tr:first-child').innerText.includes('active')")
     assert page.troubles == []
 
@@ -107,6 +113,117 @@ def test_alarms_are_acknowledged_and_shelved(server: Server, page: Browser) -> N
     page.until("document.querySelector('#alarms .quietly')")
     page.click("#alarms button:last-of-type")
     page.until("!document.querySelector('#alarms .quietly')")
+    assert page.troubles == []
+
+
+def test_inputs_limits_plans_and_files(server: Server, page: Browser) -> None:
+    limits = {"yellow": [None, 290.3], "red": [None, 290.35]}
+    mode = {"kind": "auxiliary", "levels": True}
+    limited = {**SPEC["channels"], "T_px": {**SPEC["channels"]["T_px"], "limits": limits}, "mode": mode}
+    server.client().register({**SPEC, "channels": limited})
+    times = [60.0 * k for k in range(200)]
+    values = {"T_px": [290.0 + 0.001 * k for k in range(200)], "T_tank": [15.0] * 200, "Q_px": [0.5] * 200}
+    server.client().ingest("benchsat", times, {**values, "mode": [float(k // 100) for k in range(200)]})
+    page.until("document.querySelector('#inputs canvas')")
+    assert page.text("#input-legend").split() == ["Q_px", "mode"]
+    page.click("#input-legend button:last-child")
+    assert (
+        page.evaluate("document.querySelector('#input-legend button:last-child').getAttribute('aria-pressed')")
+        == "false"
+    )
+    assert "hidden=mode" in page.evaluate("location.hash")
+
+    page.click("#what-if")
+    page.until("document.getElementById('toasts').innerText.includes('needs an active model')")
+    page.click("#calibrate")
+    page.until("document.getElementById('now-note').innerText.includes('expected in')")
+    page.evaluate(
+        "(e => { e.value = '10800'; e.dispatchEvent(new Event('change')); })(document.getElementById('horizon'))"
+    )
+    page.until("document.getElementById('now-note').innerText.includes('expected in 3 h')")
+    assert "ahead=10800" in page.evaluate("location.hash")
+    page.click("#predicted")
+    page.until("document.getElementById('plot-note').innerText.includes('predicted one sample ahead')")
+
+    page.click("#what-if")
+    page.until("document.getElementById('plan-dialog').open")
+    page.evaluate("document.querySelector('#plan-rows input[type=number]').value = '7'")
+    page.evaluate("document.querySelector('#plan-rows input[type=datetime-local]').value = '2030-01-01T00:00'")
+    page.click("#plan-show")
+    page.until("!document.getElementById('plan-refused').hidden")  # the plan begins after the forecast ends
+    page.evaluate("document.querySelector('#plan-rows input[type=datetime-local]').value = '1970-01-01T04:00'")
+    page.click("#plan-show")
+    page.until("!document.getElementById('plan-dialog').open")
+    page.until("document.getElementById('plot-note').innerText.includes('with your plan')")
+
+    page.evaluate("HTMLAnchorElement.prototype.click = () => {}")
+    keep = "(blob) => { blob.text().then((text) => { window.saved = text; }); return 'about:blank'; }"
+    page.evaluate(f"URL.createObjectURL = {keep}; 0")
+    page.click("#csv")
+    page.until("window.saved")
+    head, first = page.evaluate("window.saved").split("\r\n")[:2]
+    assert head.startswith("time,T_px [K],T_tank [degC],Q_px [W],T_px forecast,T_px 5 %,T_px 95 %,T_px with the plan")
+    assert first.startswith("1970-01-01T00:00:00Z,290,15,0.5,")
+    (refused,) = page.troubles
+    assert "422" in refused
+
+
+def test_a_time_is_entered_and_the_address_keeps_it(server: Server, page: Browser) -> None:
+    server.client().register(SPEC)
+    send(server, 0)
+    page.until("document.getElementById('from').value !== ''")
+    page.evaluate("document.getElementById('from').value = '1970-01-01T01:00:00'")
+    page.evaluate("document.getElementById('to').value = '1970-01-01T01:30:00'")
+    page.click("#times button")
+    page.until("document.getElementById('plot-note').innerText.startsWith('31 samples')")
+    address = page.evaluate("location.href")
+    assert "from=1970-01-01T01:00:00Z&to=1970-01-01T01:30:00Z" in address
+    page.open("about:blank")
+    page.open(address)
+    page.until("document.getElementById('plot-note').innerText.startsWith('31 samples')")
+    assert page.evaluate("document.getElementById('to').value") in ("1970-01-01T01:30:00", "1970-01-01T01:30")
+    page.evaluate("document.getElementById('to').value = '1970-01-01T00:30:00'")
+    page.click("#times button")
+    page.until("document.getElementById('toasts').innerText.includes('must come before')")
+    assert page.troubles == []
+
+
+def test_several_twins_begin_with_an_overview(server: Server, page: Browser) -> None:
+    for twin in ("first", "second"):
+        server.client().register({**SPEC, "twin": twin})
+    limits = {"red": [None, 295.0]}
+    hot = {**SPEC["channels"], "T_px": {**SPEC["channels"]["T_px"], "limits": limits}}
+    server.client().register({**SPEC, "twin": "third", "channels": hot})
+    server.client().ingest("third", [9000, 9001, 9002], {"T_px": [290.0, 296.0, 297.0]})
+    page.open("about:blank")
+    page.open(server.url)
+    page.until("document.querySelectorAll('#fleet-list li').length === 3")
+    page.until("document.querySelector('#fleet-list li').innerText.startsWith('third')")
+    page.until("document.querySelector('#fleet-list li').innerText.includes('1 red')")
+    assert page.evaluate("document.getElementById('main').hidden")
+    page.click("#fleet-list li:nth-child(2) button")
+    page.until("document.getElementById('twin').value === 'first' && !document.getElementById('main').hidden")
+    assert page.evaluate("location.hash").startswith("#first?range=")
+    page.until("document.getElementById('facts').innerText.includes('samples')")
+    page.press("f")
+    page.until("!document.getElementById('fleet').hidden")
+    page.resize(390, 800)
+    page.until("document.documentElement.scrollWidth <= 390")
+    assert page.troubles == []
+
+
+def test_the_heat_flows_can_be_walked_with_the_keyboard(server: Server, page: Browser) -> None:
+    server.client().register(SPEC)
+    send(server, 0)
+    page.until("document.querySelector('#temperatures canvas')")
+    page.click("#calibrate")
+    page.until("document.getElementById('network-note').innerText.startsWith('at ')")
+    page.evaluate("document.querySelector('#network .place').focus()")
+    assert page.evaluate("document.activeElement.getAttribute('aria-label')").startswith("px: ")
+    page.resize(390, 800)
+    page.until("document.getElementById('facts').offsetHeight > 0")
+    assert "model v1" in page.text("#facts")
+    page.until("document.documentElement.scrollWidth <= 390")
     assert page.troubles == []
 
 

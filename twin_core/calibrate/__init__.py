@@ -74,7 +74,14 @@ def _by_neural_ode(spec: TwinSpec, records: Sequence[Record], loss: str, progres
     """Calibrate by the method of paper A."""
     if loss != "squared":
         raise ModelError(f"method 'neural-ode' knows the squared loss only; use second-order with '{loss}'")
-    from twin_core.calibrate.neural_ode import fit_neural_ode
+    try:
+        from twin_core.calibrate.neural_ode import fit_neural_ode
+    except ModuleNotFoundError as error:
+        if error.name not in ("torch", "torchdiffeq"):
+            raise
+        raise ModelError(
+            f"method 'neural-ode' needs {error.name}, which is not installed: pip install 'thermal-twin[neural]'"
+        ) from error
     from twin_core.calibrate.second_order import to_model
 
     _, calibration = fit_neural_ode(spec, records, progress=progress)

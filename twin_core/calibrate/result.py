@@ -21,7 +21,7 @@ LEAST_STEP_S = 1e-3
 """No thermal record is sampled faster; a shorter step would only fill the memory."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CalibratedModel:
     """A network at its calibrated values.
 
@@ -60,6 +60,11 @@ class CalibratedModel:
     max_step_s: float
     table_knots: dict[tuple[str, str], tuple[float, ...]] = field(default_factory=dict)
     summary: Json = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """Tell what it is in one line."""
+        added = ", ".join(effect.label for effect in self.effects) or "no effect"
+        return f"<CalibratedModel {self.spec.twin}: {len(self.free_names)} calibrated parameters, {added} added>"
 
     def network(self) -> Network:
         """Return the network at the calibrated values."""

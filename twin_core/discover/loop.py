@@ -32,7 +32,7 @@ AFTERWARDS = 0.1
 """Share of the deadline that the witness may take beyond it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ClosedLoop:
     """What a closed loop leaves: the report, the corrected model, the declared one, and what the page plots."""
 
@@ -40,6 +40,15 @@ class ClosedLoop:
     model: CalibratedModel
     before_model: CalibratedModel
     plots: Json
+
+    def __repr__(self) -> str:
+        """Tell what came of it in one line."""
+        found = ", ".join(finding["effect"] for finding in self.report["findings"]) or "nothing"
+        before, after = self.report["before"]["rmse_K"], self.report["after"]["rmse_K"]
+        twin, verdict = self.report["twin"], self.report["verdict"]
+        return (
+            f"<ClosedLoop {twin}: {verdict}, {found} added; held-out rmse {before:.3g} K before, {after:.3g} K after>"
+        )
 
 
 def close_loop(

@@ -357,6 +357,12 @@ class TwinSpec(Strict):
     heaters: tuple[Heater, ...] = ()
     derived: dict[Name, Derived] = Field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        """Tell what it declares in one line."""
+        couplings = len(self.conductors) + len(self.radiators) + len(self.radiation)
+        sensors = ", ".join(self.sensors[:5]) + (", ..." if len(self.sensors) > 5 else "")
+        return f"<TwinSpec {self.twin}: {len(self.nodes)} nodes, {couplings} couplings, sensors {sensors}>"
+
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
         problems = list(dict.fromkeys(self._problems()))
@@ -407,8 +413,8 @@ class TwinSpec(Strict):
         A single one may yet be joined by what the closed loop finds; it is told among the doubts.
         """
         groups = {node.id: {node.id} for node in self.nodes}
-        for conductor in self.conductors:
-            one, other = (groups.get(end) for end in conductor.between)
+        for first, second in [*(c.between for c in self.conductors), *(r.between for r in self.radiation)]:
+            one, other = groups.get(first), groups.get(second)
             if one is not None and other is not None and one is not other:
                 one |= other
                 groups |= dict.fromkeys(other, one)

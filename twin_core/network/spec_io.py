@@ -46,6 +46,9 @@ def _is_type(part: str) -> bool:
 _TYPES_TRIED = ("str", "constrained-str", "float")
 
 
+_QUANTITIES = ("Quantity", "Conductance", "HeatCapacity", "ExchangeArea")
+
+
 _WORDING = {
     "extra_forbidden": "unknown field; remove it or correct its spelling",
     "missing": "is missing",
@@ -71,6 +74,8 @@ _PATTERN_WORDING = {
 def _wording(problem: Mapping[str, Any]) -> str:
     """Return what is wrong in words of the specification rather than of the validator."""
     kind, given = problem["type"], problem["input"]
+    if kind == "model_type" and isinstance(given, int | float) and problem["ctx"]["class_name"] in _QUANTITIES:
+        return f"write {{value: {given:g}}} where it is known, or {{guess: {given:g}}} where it is to be calibrated"
     if kind == "string_pattern_mismatch":
         message = _PATTERN_WORDING[problem["ctx"]["pattern"]]
     else:

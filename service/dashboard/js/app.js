@@ -1,22 +1,29 @@
 // The page: one twin at a time, brought up to date by its event stream.
 import { ApiError, call, follow, onKeyNeeded } from "./api.js";
-import { ResidualChart, TemperatureChart, forecastLength } from "./charts.js";
+import { readAddress, writeAddress } from "./address.js";
+import { InputChart, ResidualChart, TemperatureChart, forecastLength } from "./charts.js";
+import { csvOf, save } from "./csv.js";
 import { clock, colour, count, isDark, make, seconds, span, toUnit, unitName } from "./format.js";
 import { NetworkDrawing, declared } from "./network.js";
-import { drawAlarms, drawAnomalies, drawJobs, drawModels, drawNow } from "./panels.js";
+import { drawAlarms, drawAnomalies, drawComparison, drawFleet, drawJobs, drawModels, drawNow } from "./panels.js";
+import { PlanEditor } from "./plan.js";
 
 const $ = (id) => document.getElementById(id);
 const RANGES = [["1 h", 3600], ["6 h", 21600], ["1 d", 86400], ["7 d", 604800], ["all", Infinity]];
+const HORIZONS = [["as the range", 0], ["1 h", 3600], ["3 h", 10800], ["6 h", 21600], ["12 h", 43200], ["1 d", 86400], ["3 d", 259200]];
 const POINTS = 1500;
+const MOST_CHANGES = 12;  // a channel that changes more often than that has no marks of its own
 const LEAST_PAUSE_MS = 700;
 const CATCH_UP_MS = 1000;  // what is assimilated in arrears is not told one by one
 
 const state = {
   twin: null, detail: null, range_s: 86400, zoom: null, unit: null, kind: "residual", hidden: new Set(),
   latest: {}, anomalies: [], alarms: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, stop: null, again: null, link: "off",
+  horizon_s: 0, predicted: false, plan: null, planned: null, activations: [], fleet: false, twins: [],
 };
 let zoomTo = () => {};
 const temperatures = new TemperatureChart($("temperatures"), (ends) => zoomTo(ends));
+const inputs = new InputChart($("inputs"), (ends) => zoomTo(ends));
 const residuals = new ResidualChart($("residuals"), (ends) => zoomTo(ends));
 const drawing = new NetworkDrawing($("network"));
 
@@ -27,6 +34,15 @@ const units = () => Object.fromEntries(Object.entries(state.detail.specification
 const sensors = () => {
   const names = state.detail.specification.nodes.flatMap((n) => n.sensor || []);
   return names.map((name, index) => ({ name, index, shown: !state.hidden.has(name) }));
+};
+
+// What drives the temperatures: every channel that reads no node, boundaries included.
+const drivers = () => {
+  const read = new Set(sensors().map((s) => s.name)), channels = state.detail.specification.channels;
+  return Object.entries(channels).filter(([name]) => !read.has(name)).map(([name, c], index) => ({
+    name, index: index + 3, shown: !state.hidden.has(name), unit: c.unit || (c.kind === "auxiliary" ? "1" : ""), kind: c.kind, levels: Boolean(c.levels),
+    held: c.kind !== "temperature" && c.interpolation !== "linear",
+  }));
 };
 
 const unitShown = () => state.unit || (sensors().some((s) => units()[s.name] === "degC") ? "degC" : "K");
@@ -83,7 +99,7 @@ async function pump() {
 async function load(parts) {
   const twin = state.twin, path = `v1/twins/${twin}`;
   if (parts.has("detail") || parts.has("plots")) state.detail = await call(path);
-  if (parts.has("models")) state.models = (await call(`${path}/models`)).models;
+  if (parts.has("models")) ({ models: state.models, activations: state.activations } = await call(`${path}/models`));
   if (parts.has("jobs")) {
     const lists = await Promise.all([call(`${path}/calibrations`), call(`${path}/diagnoses`)]);
     for (const job of lists.flatMap((l) => l.jobs)) state.jobs.set(job.id, job);
@@ -100,16 +116,18 @@ async function load(parts) {
 
 async function loadPlots(path) {
   const { start, stop, live } = window_s();
-  const names = sensors().map((s) => s.name).join(",");
+  const names = [...sensors(), ...drivers()].map((s) => s.name).join(",");
   const query = `start=${start}&stop=${stop + 1e-6}&max_points=${POINTS}`;
-  const horizon = forecastLength(stop - start);
+  const horizon = state.horizon_s || forecastLength(stop - start);
+  const look = { horizon_s: horizon, step_s: horizon / 120 };
   const active = state.detail.active_model !== null;
   const optional = (promise) => promise.catch((error) => { if (error instanceof ApiError && error.status < 500) return null; throw error; });
-  [state.archive, state.residuals, state.ahead, state.network] = await Promise.all([
+  [state.archive, state.residuals, state.ahead, state.network, state.planned] = await Promise.all([
     call(`${path}/telemetry?channels=${encodeURIComponent(names)}&${query}`),
-    active ? optional(call(`${path}/residuals?${query}`)) : null,
-    active && live ? optional(call(`${path}/forecast?horizon_s=${horizon}&step_s=${horizon / 120}`)) : null,
+    active ? optional(call(`${path}/residuals?${query}${state.predicted ? "&predicted=true" : ""}`)) : null,
+    active && live ? optional(call(`${path}/forecast?horizon_s=${look.horizon_s}&step_s=${look.step_s}`)) : null,
     active ? optional(call(`${path}/network`)) : null,
+    active && live && state.plan ? optional(call(`${path}/forecasts`, { method: "POST", body: { ...look, plan: state.plan } })) : null,
   ]);
   for (const [name, column] of Object.entries(state.archive.values)) {
     const known = live ? column.filter((v) => v !== null).at(-1) : undefined;
@@ -120,6 +138,7 @@ async function loadPlots(path) {
 // ---- drawing
 
 function render(parts) {
+  drawTimes();
   drawFacts();
   drawLink();
   if (parts.has("detail")) renderNow();
@@ -178,8 +197,11 @@ function renderPlots() {
   if (!state.archive || !state.detail.last_time) {
     temperatures.clear(make("b", {}, "No telemetry yet"), make("span", {}, "Send samples and they appear here at once."));
     residuals.clear(make("span", {}, "Residuals need telemetry and an active model."));
+    inputs.clear();
+    $("inputs").hidden = drivers().length === 0;
   } else {
     renderTemperatures(list, unit, from);
+    renderInputs(unit);
     renderResiduals(list);
   }
   renderNow();
@@ -193,16 +215,63 @@ function renderTemperatures(list, unit, from) {
   const forecast = ahead && {
     time: ahead.time.map(seconds), mean: per((n) => ahead.values[n].mean), low: per((n) => ahead.values[n].q05), high: per((n) => ahead.values[n].q95),
   };
-  const end = forecast ? forecast.time.at(-1) : stop;
+  const end = forecast ? forecast.time.at(-1) : stop, found = state.residuals;
+  const predicted = state.predicted && found && found.predicted
+    ? { time: found.time.map(seconds), values: per((n) => found.predicted[n]) } : null;
+  const planned = state.planned && forecast ? { time: state.planned.time.map(seconds), values: per((n) => state.planned.values[n].mean) } : null;
   temperatures.update({
     range: [start, end], sensors: list, unit: unitName(unit), now: ahead ? seconds(ahead.from) : null, forecast,
+    predicted, planned, limits: limits(list, unit, from), marks: marks(),
     measured: { time: archive.time.map(seconds), values: per((n) => archive.values[n]) },
   });
   $("plot-note").textContent = [
     archive.downsampled ? `extremes of ${count(archive.samples)} samples` : `${count(archive.samples)} samples`,
     ahead ? `dashed: forecast with its 90 % band${assumed(ahead.inputs)}` : "",
+    predicted ? "dotted: predicted one sample ahead" : "",
+    planned ? "thick: with your plan" : "",
     ahead && ahead.behind_s > 0 ? `not from the present: ${span(ahead.behind_s)} behind the last sample` : "",
   ].filter(Boolean).join(" · ");
+}
+
+function limits(list, unit, from) {
+  return list.flatMap(({ name, index }) => Object.entries(state.detail.specification.channels[name].limits || {})
+    .flatMap(([look, ends]) => ends.filter((v) => v !== null).map((v) => ({ name, index, colour: look, bound: toUnit(v, from[name], unit) }))));
+}
+
+// What happened in the time shown: modes and heaters that changed, models that were activated.
+function marks() {
+  const { archive } = state, found = [];
+  for (const { name, kind, levels } of drivers()) {
+    const column = archive.values[name] || [], known = column.filter((v) => v !== null);
+    if (!levels && !(kind === "power" && new Set(known).size <= 3)) continue;
+    let last = null;
+    const changes = [];
+    column.forEach((value, i) => {
+      if (value === null) return;
+      if (last !== null && value !== last) changes.push({ time: seconds(archive.time[i]), text: levels ? `${name} ${value}` : `${name} ${value > last ? "on" : "off"}` });
+      last = value;
+    });
+    if (levels || changes.length <= MOST_CHANGES) found.push(...changes);
+  }
+  for (const { version, time } of state.activations) found.push({ time: seconds(time), text: `model v${version}` });
+  return found.sort((a, b) => a.time - b.time);
+}
+
+function renderInputs(unit) {
+  const list = drivers(), { archive, ahead, plan } = state;
+  $("inputs").hidden = list.length === 0;
+  if (!list.length) return;
+  const { start, stop } = window_s();
+  const convert = (column, s) => (s.kind === "temperature" ? column.map((v) => toUnit(v, s.unit, unit)) : column);
+  const shown = list.map((s) => ({ ...s, unit: s.kind === "temperature" ? unitName(unit) : s.unit }));
+  const until = ahead ? seconds(ahead.time.at(-1)) : stop;  // what a plan says last holds on
+  const held = (column) => [...column, column.findLast((v) => v !== null)];
+  const planned = plan && { time: [...plan.time, until], values: Object.fromEntries(list.map((s) => [s.name, plan.values[s.name] ? held(plan.values[s.name]) : [...plan.time, until].map(() => null)])) };
+  inputs.update({
+    range: [start, until], inputs: shown, time: archive.time.map(seconds), planned,
+    values: Object.fromEntries(list.map((s) => [s.name, convert(archive.values[s.name] || archive.time.map(() => null), s)])),
+  });
+  legend($("input-legend"), shown);
 }
 
 // What the forecast takes the inputs to do, in words: ", Q_sun repeats, Q_box holds".
@@ -230,20 +299,25 @@ function renderResiduals(list) {
   $("residual-note").textContent = `measured minus predicted one step ahead, model v${found.model_version[0]}`;
 }
 
-function renderLegend(list) {
-  $("legend").replaceChildren(...list.map((s) => {
+const renderLegend = (list) => legend($("legend"), list);
+
+function legend(box, list) {
+  const focused = box.contains(document.activeElement) ? [...box.children].indexOf(document.activeElement) : -1;
+  box.replaceChildren(...list.map((s) => {
     const dot = make("span", { class: "dot" });
     dot.style.background = colour(s.index);
     return make("button", { "aria-pressed": String(s.shown), title: "Click: show or hide. Alt-click: this one only.", onclick: (e) => toggle(s.name, e.altKey) }, dot, s.name);
   }));
+  if (focused >= 0) box.children[focused]?.focus();
 }
 
 function toggle(name, alone) {
-  const names = sensors().map((s) => s.name);
+  const room = sensors().some((s) => s.name === name) ? sensors() : drivers(), names = room.map((s) => s.name);
   if (alone) {
     const only = names.every((n) => (n === name) !== state.hidden.has(n));
-    state.hidden = new Set(only ? [] : names.filter((n) => n !== name));
+    names.forEach((n) => state.hidden[only || n === name ? "delete" : "add"](n));
   } else if (!state.hidden.delete(name)) state.hidden.add(name);
+  keepAddress();
   renderPlots();
 }
 
@@ -261,12 +335,56 @@ function renderJobs() {
 function renderModels() {
   $("model-note").textContent = state.models.length ? "" : "none yet";
   drawModels($("models"), state.models, (model) => attempt(async () => {
+    if (!(await agreed(model))) return;
     await call(`v1/twins/${state.twin}/models/${model.version}/activate`, { method: "POST" });
     toast(`Version ${model.version} is active`, "good");
   }));
 }
 
 // ---- what the operator does
+
+// Shows a version beside the active one; true if the operator wants the switch.
+function agreed(model) {
+  const dialog = $("activate-dialog"), worse = drawComparison($("compare"), state.models.find((m) => m.active), model);
+  $("activate-title").textContent = worse || `Activate version ${model.version}?`;
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+}
+
+// Compares a plan with the forecast; a plan that the service refuses leaves everything as it was.
+async function comparePlan(plan) {
+  if (plan) {
+    const { start, stop } = window_s(), horizon_s = state.horizon_s || forecastLength(stop - start);
+    await call(`v1/twins/${state.twin}/forecasts`, { method: "POST", body: { horizon_s, step_s: horizon_s / 120, plan } });
+  }
+  state.plan = plan;
+  $("what-if").setAttribute("aria-pressed", String(Boolean(plan)));
+  refresh("plots");
+}
+const editor = new PlanEditor($, comparePlan);
+
+function openPlan() {
+  const list = drivers().filter((s) => s.kind !== "auxiliary" || s.held);
+  if (state.detail.active_model === null || !state.ahead) return toast("A plan needs an active model and a forecast from the present.", "bad");
+  if (!list.length) return toast("This twin has no inputs to plan.", "bad");
+  editor.open(list, seconds(state.ahead.from));
+}
+
+function download() {
+  if (!state.archive) return;
+  const { archive, ahead, planned } = state, shown = [...sensors(), ...drivers()].filter((s) => s.shown);
+  save(`${state.twin}.csv`, csvOf({ archive, ahead, planned, names: shown.map((s) => s.name), units: units() }));
+}
+
+const keepAddress = () => history.replaceState(null, "", writeAddress(state.fleet ? { twin: null } : state));
+const local = (unix_s) => new Date(unix_s * 1000).toISOString().slice(0, 19);
+
+function drawTimes() {
+  const shown = state.detail?.last_time ? window_s() : null;
+  if (!shown || $("times").contains(document.activeElement)) return;
+  [$("from").value, $("to").value] = [local(shown.start), local(shown.stop)];
+}
 
 const room = (kind) => (kind === "calibration" ? "calibrations" : "diagnoses");
 
@@ -294,6 +412,7 @@ const tell = (alarm, what, body = {}) => attempt(async () => {
 zoomTo = (ends) => {
   state.zoom = ends;
   drawRanges();
+  keepAddress();
   refresh("plots");
 };
 
@@ -338,14 +457,46 @@ function hear(message) {
   }
 }
 
-function select(twin) {
+function showFleet(is_on) {
+  state.fleet = is_on;
+  if (is_on) {
+    if (state.stop) state.stop.abort();
+    state.twin = null;
+    $("facts").replaceChildren();
+    $("link").dataset.state = "live";
+    $("link-text").textContent = `${state.twins.length} twins`;
+    keepAddress();
+  }
+  $("fleet").hidden = !is_on;
+  $("main").hidden = $("picker").hidden = is_on || !state.twins.length;
+  $("to-fleet").hidden = is_on || state.twins.length < 2;
+  if (is_on) renderFleet();
+}
+
+function renderFleet() {
+  const focused = document.activeElement?.closest("#fleet-list button")?.querySelector("b")?.textContent;
+  drawFleet($("fleet-list"), state.twins, (twin) => select(twin));
+  [...$("fleet-list").querySelectorAll("button")].find((b) => b.querySelector("b").textContent === focused)?.focus();
+  const busy = state.twins.filter((t) => t.red || t.yellow || t.open_anomalies || t.state === "stale").length;
+  $("fleet-note").textContent = busy ? `${busy} of ${state.twins.length} need somebody` : `${state.twins.length} twins, nothing open`;
+}
+
+function select(twin, view = {}) {
   if (state.stop) state.stop.abort();
-  Object.assign(state, { twin, detail: null, zoom: null, hidden: new Set(), latest: {}, anomalies: [], alarms: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, network: null });
+  showFleet(false);
+  state.range_s = view.range_s ?? state.range_s;
+  state.unit = view.unit ?? state.unit;
+  state.horizon_s = view.horizon_s ?? state.horizon_s;
+  $("horizon").value = String(state.horizon_s);
+  $("what-if").setAttribute("aria-pressed", "false");
+  Object.assign(state, { twin, detail: null, zoom: view.zoom ?? null, hidden: new Set(view.hidden ?? []), plan: null, planned: null, activations: [], latest: {}, anomalies: [], alarms: [], jobs: new Map(), models: [], archive: null, residuals: null, ahead: null, network: null });
   state.stop = new AbortController();
   $("twin").value = twin;
-  location.hash = twin;
+  keepAddress();
+  drawRanges();
   temperatures.clear();
   residuals.clear();
+  inputs.clear();
   refresh("detail", "models", "jobs", "anomalies", "plots");
   follow(twin, state.stop.signal, hear, (link) => {
     state.link = link;
@@ -357,14 +508,22 @@ function select(twin) {
 async function findTwins() {
   const { twins } = await call("v1/twins");
   const names = twins.map((t) => t.id);
+  state.twins = twins;
   $("empty").hidden = names.length > 0;
-  $("main").hidden = $("picker").hidden = names.length === 0;
+  $("to-fleet").hidden = state.fleet || names.length < 2;
+  if (state.fleet) renderFleet();
+  else $("main").hidden = $("picker").hidden = names.length === 0;
   if ([...$("twin").options].map((o) => o.value).join() !== names.join()) {
     $("twin").replaceChildren(...names.map((name) => make("option", { value: name }, name)));
     if (state.twin) $("twin").value = state.twin;
   }
   if (!names.length) $("link-text").textContent = "waiting for a twin";
-  if (names.length && !names.includes(state.twin)) select(names.includes(location.hash.slice(1)) ? location.hash.slice(1) : names[0]);
+  const asked = readAddress(location.hash);
+  if (!names.length) state.twin = null;
+  else if (state.fleet || names.includes(state.twin)) return;
+  else if (names.includes(asked.twin)) select(asked.twin, asked);
+  else if (names.length > 1) showFleet(true);
+  else select(names[0]);
 }
 
 const step = (by) => {
@@ -380,20 +539,23 @@ function switchTheme() {
 
 function switchUnit() {
   state.unit = unitShown() === "K" ? "degC" : "K";
+  keepAddress();
   renderPlots();
 }
 
 const KEYS = [
   ["1–5", "time range: an hour to everything"], ["0", "follow the present again"],
   ["← →", "earlier, later"], ["+ −", "closer, wider"], ["c", "calibrate"], ["d", "diagnose"],
-  ["n", "residual or NIS"], ["u", "kelvin or degrees Celsius"], ["t", "light or dark"], ["j / k", "next or previous twin"], ["?", "these keys"],
+  ["n", "residual or NIS"], ["p", "what was predicted"], ["w", "what if: plan inputs"], ["s", "save as CSV"], ["f", "all twins"], ["u", "kelvin or degrees Celsius"], ["t", "light or dark"], ["j / k", "next or previous twin"], ["?", "these keys"],
 ];
 
 function pressed(event) {
-  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, dialog") || !state.detail) return;
+  if (event.ctrlKey || event.metaKey || event.altKey || event.target.closest("input, select, dialog") || !(state.detail || state.fleet)) return;
+  if (state.fleet) return event.key === "t" ? switchTheme() : undefined;
   const acts = {
     c: () => $("calibrate").click(), d: () => $("diagnose").click(), t: switchTheme, u: switchUnit, j: () => step(1), k: () => step(-1),
     n: () => { state.kind = state.kind === "nis" ? "residual" : "nis"; drawKinds(); renderPlots(); },
+    p: () => $("predicted").click(), w: openPlan, s: download, f: () => state.twins.length > 1 && showFleet(true),
     ArrowLeft: () => move(-0.5), ArrowRight: () => move(0.5), "+": () => move(0, 0.5), "-": () => move(0, 2),
     0: () => zoomTo(null), "?": () => $("help-dialog").showModal(),
   };
@@ -423,6 +585,27 @@ $("calibrate").addEventListener("click", () => startJob("calibration"));
 $("diagnose").addEventListener("click", () => startJob("diagnosis"));
 $("theme").addEventListener("click", switchTheme);
 $("unit").addEventListener("click", switchUnit);
+$("to-fleet").addEventListener("click", () => showFleet(true));
+$("what-if").addEventListener("click", openPlan);
+$("csv").addEventListener("click", download);
+$("predicted").addEventListener("click", () => {
+  state.predicted = !state.predicted;
+  $("predicted").setAttribute("aria-pressed", String(state.predicted));
+  refresh("plots");
+});
+$("horizon").replaceChildren(...HORIZONS.map(([label, length]) => make("option", { value: length }, label)));
+$("horizon").addEventListener("change", () => {
+  state.horizon_s = Number($("horizon").value);
+  keepAddress();
+  refresh("plots");
+});
+$("times").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const ends = [$("from").value, $("to").value].map((text) => Date.parse(`${text}Z`) / 1000);
+  if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return toast("The first time must come before the last one.", "bad");
+  document.activeElement.blur();
+  zoomTo(ends);
+});
 $("help").addEventListener("click", () => $("help-dialog").showModal());
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { if (state.detail) renderPlots(); });
 addEventListener("keydown", pressed);

@@ -2,6 +2,7 @@
 import { clock, colour, css, make, number } from "./format.js";
 
 const PAST_SHARE = 0.35;
+const MOST_MARKS = 40;
 
 function axes(unit) {
   const grid = { stroke: css("--line"), width: 1 };
@@ -104,15 +105,16 @@ function paddedRange(low, high) {
 }
 
 export class TemperatureChart extends Chart {
-  // view: {range, sensors: [{name, index, shown}], measured: {time, values}, forecast: {time, mean, low, high} | null, unit}
+  // view: {range, sensors: [{name, index, shown}], measured: {time, values}, forecast: {time, mean, low, high} | null, unit,
+  //        predicted: {time, values} | null, planned: {time, mean} | null, limits: [{index, colour, bound}], marks: [{time, text}]}
   update(view) {
     this.range = view.range;
     this.view = view;
     const { data, series, bands } = this.columns(view);
-    const shape = JSON.stringify([view.sensors, view.unit, css("--line"), view.forecast !== null]);
+    const shape = JSON.stringify([view.sensors, view.unit, css("--line"), view.forecast !== null, view.predicted !== null, view.planned !== null]);
     this.draw(shape, {
       series, bands, axes: axes(view.unit), plugins: [tooltip(this.host, (u, i) => this.rows(i))],
-      hooks: { draw: [(u) => this.drawPresent(u)] },
+      hooks: { drawAxes: [(u) => this.drawLimits(u)], draw: [(u) => this.drawMarks(u), (u) => this.drawPresent(u)] },
     }, data);
   }
 
@@ -131,16 +133,30 @@ export class TemperatureChart extends Chart {
       const last = join.length ? [lastOf(view.measured.values[sensor.name])] : [];
       for (const [kind, style] of [["mean", { width: 1.6, dash: [5, 4] }], ["high", { width: 0 }], ["low", { width: 0 }]]) {
         data.push([...lead, ...last, ...view.forecast[kind][sensor.name]]);
-        series.push({ label: `${sensor.name} ${kind}`, stroke, show, points, ...style });
+        series.push({ label: `${sensor.name} ${kind}`, stroke, show, points, spanGaps: true, ...style });
       }
       const top = series.length - 2;
       bands.push({ series: [top, top + 1], fill: `${stroke}2b` });
     }
-    return { data, series, bands };
+    return this.joined(view, data, series, bands);
   }
 
-  rows(i) {
+  // Adds what the model predicted, and what a plan leads to, which have times of their own.
+  joined(view, data, series, bands) {
+    const tables = [data], points = { show: false };
+    for (const [extra, style] of [[view.predicted, { width: 1.2, dash: [1.5, 3] }], [view.planned, { width: 2.4 }]]) {
+      if (!extra) continue;
+      tables.push([extra.time, ...view.sensors.map((s) => extra.values[s.name])]);
+      for (const s of view.sensors) series.push({ label: `${s.name} again`, stroke: colour(s.index), show: s.shown, points, spanGaps: true, ...style });
+    }
+    return { data: tables.length > 1 ? uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 1))) : data, series, bands };
+  }
+
+  rows(at) {
     const { view } = this, n = view.measured.time.length;
+    const time = this.plot.data[0][at], all = [...view.measured.time, ...(view.forecast ? view.forecast.time : [])];
+    const i = all.indexOf(time);
+    if (i < 0) return [];
     const known = i < n;
     return view.sensors.filter((s) => s.shown).map((s) => {
       const source = known ? view.measured.values[s.name][i] : view.forecast.mean[s.name][i - n];
@@ -148,6 +164,63 @@ export class TemperatureChart extends Chart {
       const band = known ? "" : ` ± ${number((view.forecast.high[s.name][i - n] - view.forecast.low[s.name][i - n]) / 2)}`;
       return [colour(s.index), s.name, `${number(source)}${band} ${view.unit}`];
     }).filter(Boolean);
+  }
+
+  // Limits of the sensors shown, where the plot reaches them.
+  drawLimits(u) {
+    const { ctx, bbox } = u, dot = devicePixelRatio;
+    ctx.save();
+    ctx.font = `${10.5 * dot}px system-ui, sans-serif`;
+    for (const { index, colour: look, bound, name } of this.view.limits) {
+      const sensor = this.view.sensors.find((s) => s.name === name), y = u.valToPos(bound, "y", true);
+      if (!sensor || !sensor.shown || y < bbox.top || y > bbox.top + bbox.height) continue;
+      ctx.strokeStyle = look === "red" ? css("--bad") : css("--warn");
+      ctx.globalAlpha = 0.75;
+      ctx.lineWidth = dot;
+      ctx.setLineDash(look === "red" ? [] : [7 * dot, 4 * dot]);
+      ctx.beginPath();
+      ctx.moveTo(bbox.left, y);
+      ctx.lineTo(bbox.left + bbox.width, y);
+      ctx.stroke();
+      ctx.globalAlpha = 1;
+      ctx.fillStyle = colour(index);
+      ctx.textAlign = "right";
+      ctx.fillText(`${name} ${look}`, bbox.left + bbox.width - 4 * dot, y - 3 * dot);
+    }
+    ctx.restore();
+  }
+
+  // What happened: a mode or a heater that changed, a model that was activated.
+  drawMarks(u) {
+    const { ctx, bbox } = u, dot = devicePixelRatio;
+    const seen = this.view.marks.filter((m) => m.time >= this.range[0] && m.time <= this.range[1]).slice(-MOST_MARKS);
+    ctx.save();
+    ctx.font = `${10 * dot}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
+    ctx.textBaseline = "alphabetic";
+    let free = -Infinity;
+    for (const { time, text } of seen) {
+      const x = u.valToPos(time, "x", true);
+      ctx.strokeStyle = css("--accent");
+      ctx.globalAlpha = 0.4;
+      ctx.lineWidth = dot;
+      ctx.setLineDash([2 * dot, 4 * dot]);
+      ctx.beginPath();
+      ctx.moveTo(x, bbox.top + bbox.height * (text.startsWith("model") ? 0 : 0.85));
+      ctx.lineTo(x, bbox.top + bbox.height);
+      ctx.stroke();
+      ctx.globalAlpha = 1;
+      ctx.fillStyle = css("--accent");
+      ctx.beginPath();
+      ctx.moveTo(x - 4 * dot, bbox.top + bbox.height);
+      ctx.lineTo(x + 4 * dot, bbox.top + bbox.height);
+      ctx.lineTo(x, bbox.top + bbox.height - 7 * dot);
+      ctx.fill();
+      if (x < free) continue;
+      ctx.fillText(text, x + 5 * dot, bbox.top + bbox.height - 5 * dot);
+      free = x + ctx.measureText(text).width + 12 * dot;
+    }
+    ctx.restore();
   }
 
   drawPresent(u) {
@@ -173,6 +246,43 @@ const lastOf = (column) => {
   for (let i = column.length - 1; i >= 0; i--) if (column[i] !== null) return column[i];
   return null;
 };
+
+// Inputs below the temperatures: held values as steps, each unit with a scale of its own.
+export class InputChart extends Chart {
+  // view: {range, inputs: [{name, index, shown, unit, held}], time, values, planned: {time, values} | null, now}
+  update(view) {
+    this.range = view.range;
+    this.view = view;
+    const units = [...new Set(view.inputs.map((s) => s.unit))];
+    const steps = uPlot.paths.stepped({ align: 1 }), scales = {};
+    const tables = [[view.time, ...view.inputs.map((s) => view.values[s.name])]];
+    const series = [{}, ...view.inputs.map((s) => this.series(s, steps, { width: 1.4 }))];
+    if (view.planned) {
+      tables.push([view.planned.time, ...view.inputs.map((s) => view.planned.values[s.name])]);
+      series.push(...view.inputs.map((s) => this.series(s, steps, { width: 2.2, dash: [4, 3] })));
+    }
+    units.forEach((unit) => { scales[`in ${unit}`] = { range: (u, low, high) => paddedRange(low, high) }; });
+    const [time, value] = axes(units[0]);
+    const side = { ...value, label: units[0], scale: `in ${units[0]}` };  // one axis only: the times of both plots stay in line
+    this.draw(JSON.stringify([view.inputs, css("--line"), view.planned !== null]), {
+      series, axes: [time, side], plugins: [tooltip(this.host, (u, i) => this.rows(u, i))],
+      scales: { x: { time: true, range: () => this.range }, ...scales },
+    }, tables.length > 1 ? uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 1))) : tables[0]);
+  }
+
+  series(s, steps, style) {
+    return { label: s.name, scale: `in ${s.unit}`, stroke: colour(s.index), show: s.shown, points: { show: false }, spanGaps: true, ...(s.held ? { paths: steps } : {}), ...style };
+  }
+
+  rows(u, at) {
+    return this.view.inputs.filter((s) => s.shown).map((s, i) => {
+      const column = u.data[this.view.inputs.indexOf(s) + 1];
+      let value = null;
+      for (let k = at; k >= 0 && value === null; k--) value = column[k] ?? null;
+      return value === null ? null : [colour(s.index), s.name, `${number(value)} ${s.unit}`];
+    }).filter(Boolean);
+  }
+}
 
 export class ResidualChart extends Chart {
   // view: {range, kind: "residual" | "nis", sensors, time, values, nis, anomalies: [{sensor, start, stop}]}

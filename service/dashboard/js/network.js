@@ -80,6 +80,7 @@ export class NetworkDrawing {
   constructor(host) {
     this.host = host;
     this.key = null;
+    this.focused = null;
     new ResizeObserver(() => this.last && this.update(...this.last)).observe(host);
   }
 
@@ -94,7 +95,7 @@ export class NetworkDrawing {
       this.places = spread(layout(names, picture.links));
       this.key = key;
     }
-    const svg = draw("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": describe(picture, unit) });
+    const svg = draw("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "group", "aria-label": describe(picture, unit) });
     const strongest = Math.max(1e-9, ...picture.links.map((l) => Math.abs(l.heat_W || 0)));
     const joined = new Set();
     const labels = [];
@@ -108,7 +109,16 @@ export class NetworkDrawing {
       svg.append(...this.node(node, (node.temperature_K - low) / Math.max(high - low, 1), unit, loads));
     }
     svg.append(...labels);
+    const kept = this.host.contains(document.activeElement) ? this.focused : null;
+    this.focused = null;
     this.host.replaceChildren(svg);
+    if (kept) [...svg.querySelectorAll(".place")].find((g) => g.getAttribute("aria-label").startsWith(`${kept}:`))?.focus({ preventScroll: true });
+  }
+
+  // The flows of the node that has the focus stand out.
+  follow(id) {
+    this.focused = id;
+    for (const flow of this.host.querySelectorAll(".flow")) flow.classList.toggle("aside", id !== null && !flow.dataset.ends.split("|").includes(id));
   }
 
   link(link, strongest, joined, labels) {
@@ -126,9 +136,15 @@ export class NetworkDrawing {
     });
     flow.style.animationDuration = `${(1.9 - 1.4 * Math.sqrt(share)).toFixed(2)}s`;
     if (share < 0.004) flow.style.animation = "none";
-    flow.append(draw("title", {}, `${link.ends.join(" → ")}: ${watts(link.heat_W)}`));
-    labels.push(draw("text", { x: middle[0], y: middle[1] - 5, class: "value halo" }, watts(Math.abs(link.heat_W))));
-    return [...parts, flow];
+    const way = link.heat_W < 0 ? [...link.ends].reverse() : link.ends;
+    flow.append(draw("title", {}, `${way.join(" → ")}: ${watts(Math.abs(link.heat_W))}`));
+    flow.dataset.ends = link.ends.join("|");
+    labels.push(draw("text", { x: middle[0], y: middle[1] - 9, class: "value halo" }, watts(Math.abs(link.heat_W))));
+    if (share < 0.004) return [...parts, flow];
+    const [from, to] = link.heat_W < 0 ? [b, a] : [a, b], size = 5 + width;
+    const turn = (Math.atan2(to[1] - from[1], to[0] - from[0]) * 180) / Math.PI;
+    const head = draw("path", { d: `M${size} 0L${-size * 0.7} ${size * 0.75}L${-size * 0.7} ${-size * 0.75}Z`, class: "head", fill: link.kind === "radiator" ? "#7a6ff0" : "#e8743b", transform: `translate(${middle[0]} ${middle[1]}) rotate(${turn})` });
+    return [...parts, flow, head];
   }
 
   effect(effect) {
@@ -155,14 +171,20 @@ export class NetworkDrawing {
   node({ id, temperature_K, heat_W, sensed }, share, unit, loads) {
     const [x, y] = this.places.get(id), known = temperature_K !== null;
     const disc = draw("circle", { cx: x, cy: y, r: 25, class: sensed === false ? "node hidden-node" : "node", fill: known ? heat(share) : "var(--line-strong)" });
-    disc.append(draw("title", {}, known ? `${id}: ${number(toUnit(temperature_K, "K", unit))} ${unitName(unit)}, net ${watts(heat_W)}` : id));
+    const words = known ? `${id}: ${number(toUnit(temperature_K, "K", unit))} ${unitName(unit)}, ${net(heat_W)}` : id;
     const ink = known && share > 0.78 ? "#221408" : "#ffffff";
     const parts = [disc, draw("text", { x, y: y + 4, class: "inside", style: `fill:${ink}` }, known ? number(toUnit(temperature_K, "K", unit), 1) : "")];
     parts.push(draw("text", { x, y: y + 41, class: "halo" }, id));
-    if (Math.abs(loads) > 1e-6) parts.push(draw("text", { x, y: y - 31, class: "value halo" }, `↓ ${watts(loads)}`));
-    return parts;
+    if (Math.abs(loads) > 1e-6) parts.push(draw("text", { x, y: y - 31, class: "value halo" }, `${loads < 0 ? "↑" : "↓"} ${watts(Math.abs(loads))}`));
+    const group = draw("g", { class: "place", tabindex: 0, role: "img", "aria-label": words });
+    group.append(draw("title", {}, words), draw("circle", { cx: x, cy: y, r: 30, class: "ring" }), ...parts);
+    group.addEventListener("focus", () => this.follow(id));
+    group.addEventListener("blur", () => this.follow(null));
+    return [group];
   }
 }
+
+const net = (heat_W) => (Math.abs(heat_W) < 1e-9 ? "in balance" : `${heat_W > 0 ? "warming" : "cooling"} with ${watts(Math.abs(heat_W))}`);
 
 const describe = (picture, unit) => {
   const temperatures = picture.nodes.filter((p) => p.temperature_K !== null)

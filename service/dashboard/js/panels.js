@@ -113,3 +113,36 @@ function errorCell({ error, validation }) {
   if (!error) return make("span", { class: "sub", title: made }, "–");
   return make("b", { title: `over the newest ${count(error.samples)} samples, open loop; ${made}` }, `${number(error.rmse_K, 3)} K`);
 }
+
+// What speaks for or against a switch: the version that would be active beside the one that is.
+export function drawComparison(table, active, wanted) {
+  const row = (label, pick) => make("tr", {}, make("th", {}, label), make("td", {}, active ? pick(active) : "–"), make("td", {}, pick(wanted)));
+  const error = (m) => (m.error ? `${number(m.error.rmse_K, 3)} K over the newest ${count(m.error.samples)} samples` : "not known");
+  table.replaceChildren(
+    make("thead", {}, make("tr", {}, make("th", {}), make("th", {}, active ? `active: v${active.version}` : "active: none"), make("th", {}, `v${wanted.version}`))),
+    make("tbody", {},
+      row("Error, open loop", error), row("Made by", (m) => m.source), row("Created", (m) => clock(seconds(m.created))),
+      row("Trained on", (m) => (m.train.samples ? `${count(m.train.samples)} samples until ${String(m.train.stop).slice(0, 16).replace("T", " ")}` : "–")),
+      row("Effects", (m) => m.effects.map(effectWords).join(", ") || "none")));
+  const worse = active && active.error && wanted.error && wanted.error.rmse_K > active.error.rmse_K;
+  return worse ? `Version ${wanted.version} is ${number((wanted.error.rmse_K / active.error.rmse_K - 1) * 100, 0)} % worse than the active one` : "";
+}
+
+const STANDING = { live: ["", "live"], delayed: ["", "arrives late"], partly: ["warn", "some sensors silent"], stale: ["warn", "silent"], never: ["unknown", "no telemetry yet"] };
+
+// Every twin at a glance, what needs an operator first.
+export function drawFleet(list, twins, onPick) {
+  const rank = (t) => [t.red, t.yellow, t.open_anomalies, t.state === "stale" || t.state === "partly" ? 1 : 0];
+  const worse = (a, b) => rank(b).reduce((found, v, i) => found || v - rank(a)[i], 0) || (a.id < b.id ? -1 : 1);
+  list.replaceChildren(...[...twins].sort(worse).map((t) => {
+    const [look, words] = STANDING[t.state];
+    const state = t.red ? "bad" : t.yellow || t.open_anomalies ? "warn" : look;
+    const chips = [[t.red, "bad", "red"], [t.yellow, "warn", "yellow"], [t.open_anomalies, "warn", t.open_anomalies === 1 ? "anomaly" : "anomalies"]];
+    return make("li", {}, make("button", { class: "twin", onclick: () => onPick(t.id) },
+      make("div", { class: "row" }, make("span", { class: `state ${state}`, role: "img", "aria-label": words }), make("b", {}, t.id), make("span", { class: "sub" }, words)),
+      make("div", { class: "chips" }, ...chips.filter(([n]) => n).map(([n, c, name]) => make("span", { class: `chip ${c}` }, `${n} ${name}`)),
+        t.active_model === null ? make("span", { class: "chip" }, "no model") : make("span", { class: "chip" }, `model v${t.active_model}`),
+        t.quarantined ? make("span", { class: "chip warn" }, `${count(t.quarantined)} in quarantine`) : null),
+      make("div", { class: "sub" }, `${count(t.samples)} samples${t.last_time ? ` · last ${clock(seconds(t.last_time))}` : ""}`)));
+  }));
+}

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import numpy as np
 import orjson
 from fastapi import APIRouter, Query, Response
+from numpy.typing import NDArray
 
 from service.downsample import extremes
 from service.fit import lacks
@@ -76,6 +77,7 @@ async def list_residuals(
     stop: Stop = None,
     version: Version = None,
     max_points: Points = None,
+    predicted: Annotated[bool, Query(description="Whether to add what was predicted, in the channels' units.")] = False,
 ) -> Response:
     """Return innovations, their predicted standard deviations and the NIS, and which samples are no readings, and why."""
     start_us, stop_us = span(start, stop)
@@ -89,10 +91,13 @@ async def list_residuals(
     found, count = await service.database.read(
         residuals.overview, twin.key, chosen, n_sensors, start_us, stop_us, max_points
     )
-    masked = None
+    masked, raw = None, None
     if count <= MOST_SCREENED:
         masked = await _masked(service, twin, found)
-    document = await asyncio.to_thread(_render, twin, found, count, max_points, masked)
+        if predicted and count:
+            n, span_us = len(twin.channels), (int(found.time_us[0]), int(found.time_us[-1]) + 1)
+            raw = await service.database.read(samples.select, twin.key, n, range(n), *span_us)
+    document = await asyncio.to_thread(_render, twin, found, count, max_points, masked, raw)
     return Response(document, media_type="application/json")
 
 
@@ -108,7 +113,9 @@ async def _masked(service: Service, twin: Entry, found: Found) -> Spans:
     return screening.told(raw, masks, twin.sensors, first_us)
 
 
-def _render(twin: Entry, found: Found, count: int, max_points: int, masked: Spans | None) -> bytes:
+def _render(
+    twin: Entry, found: Found, count: int, max_points: int, masked: Spans | None, raw: samples.Samples | None
+) -> bytes:
     kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
 
     def columns(matrix: Any) -> dict[str, Any]:
@@ -124,7 +131,22 @@ def _render(twin: Entry, found: Found, count: int, max_points: int, masked: Span
         "samples": count,
         "downsampled": kept.size < count,
     }
+    if raw is not None:
+        document["predicted"] = _predicted(twin, found, kept, raw)
     return orjson.dumps(document, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def _predicted(
+    twin: Entry, found: Found, kept: NDArray[np.int64], raw: samples.Samples
+) -> dict[str, NDArray[np.float64]]:
+    """Return what was predicted one sample ahead, in the channels' units: a reading less its innovation."""
+    place = np.minimum(np.searchsorted(raw.time_us, found.time_us[kept]), raw.time_us.size - 1)
+    there = raw.time_us[place] == found.time_us[kept]
+    measured = {name: raw.values[twin.channels.index(name), place] for name in twin.sensors}
+    return {
+        name: np.where(there, measured[name] - found.innovation_K[row, kept], np.nan)
+        for row, name in enumerate(twin.sensors)
+    }
 
 
 @router.get("/anomalies", dependencies=[reads])

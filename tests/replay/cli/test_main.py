@@ -16,8 +16,19 @@ COMMANDS = sorted(twin.commands)
 
 def test_the_commands() -> None:
     assert COMMANDS == [
-        *("backup", "calibrate", "check-effect", "close-loop", "demo", "forecast", "import", "migrate"),
-        *("record", "register", "replay", "restore", "serve", "simulate"),
+        *(
+            "backup",
+            "calibrate",
+            "check",
+            "check-effect",
+            "close-loop",
+            "demo",
+            "forecast",
+            "import",
+            "init",
+            "migrate",
+        ),
+        *("record", "register", "replay", "restore", "serve", "show", "simulate"),
     ]
 
 

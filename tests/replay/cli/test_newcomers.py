@@ -1,0 +1,92 @@
+"""The first hour: drafting a specification, checking it, showing a model; durations and completion."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+
+from replay.cli.durations import DURATION
+from replay.cli.main import main
+from twin_core.network.spec_io import load_spec
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def flight(tmp_path: Path) -> Path:
+    """Return a small CSV file with every kind of column."""
+    time_s = np.arange(0.0, 6000.0, 60.0)
+    rows = ["time_s,T_box,panel_degC,Q_heater,pitch,mode,7th"]
+    rows += [
+        f"{t:g},{290 + 2 * np.sin(t / 900):.3f},{10 + 5 * np.sin(t / 700):.3f},{5 * (t > 3000)},{40 + t / 100},{int(t > 2000)},1"
+        for t in time_s
+    ]
+    path = tmp_path / "flight.csv"
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def test_a_draft_is_a_specification_that_fits(flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "sat.yaml"
+    assert main(["init", str(flight), "--out", str(out)]) == 0
+    spec = load_spec(out)
+    assert {name: c.unit for name, c in spec.channels.items() if c.kind == "temperature"} == {
+        "T_box": "K",
+        "panel_degC": "degC",
+    }
+    assert (
+        spec.channels["Q_heater"].kind == "power" and spec.channels["mode"].levels and not spec.channels["pitch"].levels
+    )
+    assert [node.id for node in spec.nodes] == ["box", "panel"]
+    assert "'7th' has no valid name" in capsys.readouterr().err
+    assert main(["check", str(out), "--telemetry", str(flight)]) == 0
+    assert "in order; 2 nodes" in capsys.readouterr().out
+    assert main(["init", str(flight), "--out", str(out)]) == 2, "an existing file stays"
+
+
+def test_all_faults_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "wrong.yaml"
+    path.write_text(
+        "twin: x\nchannels: {T: {kind: temperature, unit: F}}\n"
+        "nodes: [{id: a, sensor: T, capacity_J_per_K: 500}, {id: b, capacity_J_per_K: {gues: 3}}]\n"
+        "conductors: [{between: [a, a], conductance_W_per_K: 0.5}]\n"
+    )
+    assert main(["check", str(path)]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    for said in (
+        "nodes[0].capacity_J_per_K: write {value: 500} where it is known, or {guess: 500}",
+        "conductors[0].conductance_W_per_K: write {value: 0.5}",
+        "unit of a temperature channel is K or degC",
+        ".gues: unknown field",
+        "joins 'a' to itself",
+    ):
+        assert sum(said in line for line in lines) == 1, (said, lines)
+    assert main(["check", str(path), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["valid"] is False
+    assert main(["check", str(tmp_path / "none.yaml")]) == 2
+
+
+@pytest.mark.parametrize(
+    "text, seconds",
+    [("90", 90.0), ("90s", 90.0), ("1.5h", 5400.0), ("1d", 86400.0), ("1d12h", 129600.0), ("30min", 1800.0)],
+)
+def test_durations(text: str, seconds: float) -> None:
+    assert DURATION.convert(text, None, None) == seconds
+
+
+@pytest.mark.parametrize("text", ["soon", "1 day", "-3h", "h", "1y", ""])
+def test_no_durations(text: str) -> None:
+    with pytest.raises(click.UsageError, match="no duration"):
+        DURATION.convert(text, None, None)
+
+
+def test_the_shell_can_complete() -> None:
+    environment = {**os.environ, "_TWIN_COMPLETE": "bash_complete", "COMP_WORDS": "twin cl", "COMP_CWORD": "1"}
+    code = "from replay.cli.main import main; import sys; sys.argv = ['twin']; main()"
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=ROOT)
+    assert "close-loop" in run.stdout
