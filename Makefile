@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
+SOAK_MINUTES ?= 60
 
 .PHONY: demo test test-fast check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
@@ -61,6 +62,8 @@ bench-sufficiency: $(STAMP)
 bench-service: $(STAMP)
 	$(BIN)/python -m benchmarks.service
 	$(BIN)/python -m benchmarks.service_life
+	$(BIN)/python -m benchmarks.service_years
+	$(BIN)/python -m benchmarks.soak --minutes $(SOAK_MINUTES)
 	$(BIN)/python -m benchmarks.anomaly_events
 	$(BIN)/python -m benchmarks.forecast_coverage
 

@@ -38,12 +38,12 @@ def run(task: Task) -> dict[str, Any]:
     row = {"task": task.name, "group": task.group, "effect": case.effect}
     if trial is None:
         return row | {"bands": [], "seconds": time.perf_counter() - begun}
-    model = centred(to_model(trial.calibration, trial.present_effects), trial.fit)
+    model = centred(to_model(trial.calibration(), trial.present_effects), trial.fit)
     stds = {p["name"]: p["std"] for p in model.summary["parameters"]}
     found = parameters_json(model.effects[0], stds)
     return row | {
         "bands": [(b.name, b.mean, b.std, b.true) for b in bands(case.parameters, found)],
-        "rms_share": _rms(np.concatenate(trial.calibration.residuals) / trial.calibration.problem.noise_K),
+        "rms_share": _rms(np.concatenate(trial.calibration().residuals) / trial.calibration().problem.noise_K),
         "seconds": time.perf_counter() - begun,
     }
 

@@ -89,7 +89,7 @@ def known_effect_error(case: Case) -> float:
     best = known_effect_trial(case)
     if best is None:
         return float("nan")
-    model = to_model(best.calibration, best.present_effects)
+    model = to_model(best.calibration(), best.present_effects)
     held = split_fraction([case.record], HOLDOUT)[1]
     residuals = [p.measured_K - p.predicted_K for p in (predict(model, h) for h in held)]
     return float(np.sqrt(np.nanmean(np.concatenate(residuals) ** 2)))
@@ -104,7 +104,7 @@ def known_effect_trial(case: Case) -> Trial | None:
     starts = refined(fit, [probe.effect for probe in screen(fit, survey, kind.starts(case.where, survey)).probes[:3]])
     trials = [try_effects(base, [start], n_passes=15) for start in starts]
     trials += [t for start in starts[:1] if (t := try_on_trajectories(base, [start])) is not None]
-    return min(trials, key=lambda t: float(np.nansum(np.concatenate(t.calibration.residuals) ** 2)), default=None)
+    return min(trials, key=lambda t: float(np.nansum(np.concatenate(t.calibration().residuals) ** 2)), default=None)
 
 
 def run_all(

@@ -17,8 +17,8 @@ MAX_EFFECTS = 4
 
 def bic(trial: Trial) -> float:
     """Return the Bayesian information criterion of a calibrated trial; every sensor has a white noise of its own."""
-    problem, total = trial.calibration.problem, 0.0
-    residual = np.concatenate(trial.calibration.residuals)
+    problem, total = trial.calibration().problem, 0.0
+    residual = np.concatenate(trial.calibration().residuals)
     for column in residual.T:
         seen = column[np.isfinite(column)]
         total += seen.size * np.log(np.mean(seen**2)) if seen.size else 0.0
@@ -37,4 +37,4 @@ def greedy_bic(base: Trial) -> Regressed:
             break
         trial = best
     named: list[dict[str, object]] = [{"effect": e.name, "where": e.where} for e in trial.present_effects]
-    return Regressed(named, to_model(trial.calibration, trial.present_effects, uncertain=False))
+    return Regressed(named, to_model(trial.calibration(), trial.present_effects, uncertain=False))

@@ -17,6 +17,7 @@ from service.http.auth import Gate
 from service.http.body_limit import Bodies
 from service.http.deps import Service, known_parameters
 from service.http.head import Heads
+from service.http.observe import Observe
 from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.http.shortcut import Shortcut
 from service.intake import Intake
@@ -25,7 +26,7 @@ from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
 from service.live.silence import Silence
-from service.metrics import Metrics, Observe
+from service.metrics import Metrics
 from service.registry import Registry
 from service.settings import Settings, read_settings
 from service.store import jobs as job_table

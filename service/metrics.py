@@ -1,9 +1,6 @@
 """Prometheus metrics of one application, in a registry of its own so that applications do not share numbers."""
 
-import time
 from collections.abc import Iterable
-from functools import cache
-from http import HTTPMethod
 
 from prometheus_client import (
     CollectorRegistry,
@@ -15,14 +12,10 @@ from prometheus_client import (
     ProcessCollector,
     generate_latest,
 )
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.store.watch import Vitals
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
-METHODS = frozenset(HTTPMethod)
-"""Counted by name; whatever else a caller makes up is not, since each name is kept for ever."""
 
 
 class Metrics:
@@ -81,34 +74,3 @@ class Metrics:
     def render(self) -> bytes:
         """Return everything in the text format of Prometheus."""
         return generate_latest(self.registry)
-
-
-class Observe:
-    """ASGI layer that counts and times every HTTP request by the template of its route."""
-
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        """Count into ``metrics``."""
-        self._app = app
-        self._requests, self._duration_s = cache(metrics.requests.labels), cache(metrics.duration_s.labels)
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on and note its status."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        status = 500
-        started_s = time.perf_counter()
-
-        async def watched(message: Message) -> None:
-            nonlocal status
-            if message["type"] == "http.response.start":
-                status = message["status"]
-            await send(message)
-
-        try:
-            await self._app(scope, receive, watched)
-        finally:
-            route = getattr(scope.get("route"), "path", "other")
-            method = scope["method"] if scope["method"] in METHODS else "other"
-            self._requests(method, route, str(status)).inc()
-            self._duration_s(route).observe(time.perf_counter() - started_s)

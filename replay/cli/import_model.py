@@ -39,6 +39,13 @@ FORMATS = ("xija", "esatan", "sinda")
 )
 @click.option("--hidden", multiple=True, metavar="NODE", help="Nodes without telemetry (Xija models).")
 @click.option("--held", is_flag=True, help="Take every number as known; else what was fitted before is a guess.")
+@click.option(
+    "--spread",
+    type=click.FloatRange(min=1.0, min_open=True),
+    default=1.1,
+    show_default=True,
+    help="Factor by which a fitted number may be off, one standard deviation (Xija models).",
+)
 @click.option("--skip-unknown", is_flag=True, help="Write what was understood, and list what was not.")
 @click.option("--json", "as_json", is_flag=True, help="Print notes and refusals as JSON.")
 def import_model(
@@ -49,6 +56,7 @@ def import_model(
     constants: tuple[str, ...],
     hidden: tuple[str, ...],
     held: bool,
+    spread: float,
     skip_unknown: bool,
     as_json: bool,
 ) -> None:
@@ -68,7 +76,7 @@ def import_model(
     if kind != "sinda" and len(files) > 1:
         raise click.UsageError(f"{files[1]}: only a SINDA deck has several files")
     columns, values = _pairs(channels, "channel"), _pairs(constants, "constant")
-    found = _read(kind, texts, columns, values, hidden, held)
+    found = _read(kind, texts, columns, values, hidden, held, spread)
     refused = list(found.refused)
     if refused and not skip_unknown:
         raise SpecError(
@@ -115,6 +123,7 @@ def _read(
     constants: dict[str, str],
     hidden: tuple[str, ...],
     held: bool,
+    spread: float,
 ) -> "Imported":
     file, text = next(iter(texts.items()))
     if kind == "xija":
@@ -124,7 +133,7 @@ def _read(
             values = {name: float(value) for name, value in constants.items()}
         except ValueError as error:
             raise click.UsageError(f"--constant: {error}") from error
-        return read_xija(text, str(file), channels=channels, constants=values, hidden=hidden, held=held)
+        return read_xija(text, str(file), channels=channels, constants=values, hidden=hidden, held=held, spread=spread)
     if constants or hidden:
         raise click.UsageError("--constant and --hidden belong to Xija models")
     if kind == "esatan":

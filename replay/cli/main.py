@@ -13,6 +13,7 @@ from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
 from replay.cli.demo import demo
+from replay.cli.export import export
 from replay.cli.forecast import forecast
 from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, restore
@@ -43,7 +44,7 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(init, check, show),
+    *(init, check, show, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
     *(backup, restore, migrate),
 ):

@@ -11,6 +11,7 @@ from fastapi import Request
 
 from service.errors import FieldErrors
 from service.http.problems import Problem, fields_of
+from service.http.telemetry_body import find_non_finite
 from twin_core.errors import TwinError
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import dump_spec, load_spec, parse_mapping
@@ -75,6 +76,9 @@ def _json(body: bytes) -> dict[str, Any]:
     try:
         document = orjson.loads(body)
     except orjson.JSONDecodeError:
+        field = find_non_finite(body)
+        if field is not None:
+            raise Problem(422, f"{field}: is not a finite number", [(field, "is not a finite number")]) from None
         raise Problem(400, "body: not valid JSON", [("body", "not valid JSON")]) from None
     if not isinstance(document, dict):
         raise Problem(422, "body: must be a mapping of fields", [("body", "must be a mapping of fields")])

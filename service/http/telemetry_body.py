@@ -138,7 +138,7 @@ def _load(body: bytes, where: str) -> Any:
     try:
         return orjson.loads(body)
     except orjson.JSONDecodeError as error:
-        field = _find_non_finite(body)
+        field = find_non_finite(body)
         if field is not None:
             raise BadField(field if where == "body" else f"{where}: {field}", "is not a finite number") from None
         raise Problem(
@@ -170,7 +170,7 @@ def _refuse_repeated_in(prefix: str, pairs: list[tuple[str, Any]]) -> dict[str, 
     return found
 
 
-def _find_non_finite(body: bytes) -> str | None:
+def find_non_finite(body: bytes) -> str | None:
     """Return the place of the first NaN, Infinity or overflowing number, if that is what is wrong with the body."""
     try:
         return _search(json.loads(body), "")

@@ -6,12 +6,14 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from service.errors import Refusal
+from service.instants import now_us
 from service.jobs.runner import LEAST_SAMPLES, Jobs
 from service.registry import Entry, Registry
 from service.schemas import CalibrationRequest, DiagnosisRequest
-from service.store import anomalies, jobs, twins
+from service.store import anomalies, audit, jobs, twins
 from service.store.database import Database
 from twin_core.anomaly import adjusted, discoveries
 
@@ -114,9 +116,16 @@ class Schedule:
         if triggers and head.samples >= LEAST_SAMPLES and not self._jobs.busy(twin):
             watch.calibrated_s, watch.samples = now_s, head.samples
             request = CalibrationRequest().model_dump(mode="json") | {"trigger": triggers[-1]}
-            await self._jobs.start(twin, "calibration", request)
+            await self._start(twin, "calibration", request)
         if watch.due_by_refutation(now_s, self._patience_s, is_refuted) and not self._jobs.busy(twin):
             watch.refuted_s = None
             if not await self._database.read(jobs.asked_since_activation, twin.key, "diagnosis"):
                 request = DiagnosisRequest().model_dump(mode="json") | {"trigger": "refuted"}
-                await self._jobs.start(twin, "diagnosis", request)
+                await self._start(twin, "diagnosis", request)
+
+    async def _start(self, twin: Entry, kind: str, request: dict[str, Any]) -> None:
+        """Start a job that nobody asked for, and put that on record."""
+        row = await self._jobs.start(twin, kind, request)
+        who = f"the service ({request['trigger']})"
+        line = (who, "POST", f"/v1/twins/{twin.name}/{kind}", 202, "", f"job {row.id}")
+        await self._database.write(audit.append, now_us(), *line)

@@ -231,7 +231,7 @@ def test_wrong_request_is_refused_by_name(make_client, spec: dict, case: Case) -
     ("method", "path", "allowed"),
     [
         ("PUT", "/v1/twins", "GET, HEAD, POST"),
-        ("PATCH", "/v1/twins/benchsat", "DELETE, GET, HEAD"),
+        ("PATCH", "/v1/twins/benchsat", "DELETE, GET, HEAD, PUT"),
         ("PUT", "/v1/twins/benchsat/telemetry", "DELETE, GET, HEAD, POST"),
         ("HEAD", "/v1/twins/benchsat/forecasts", "POST"),
         ("POST", "/assets/style.css", "GET, HEAD"),

@@ -48,6 +48,10 @@ Loss = Literal["squared", "huber"]
 READINGS_PER_UNKNOWN = 2
 """Fewer are refused: any model passes through as many readings as it has unknowns."""
 
+COMPARABLE = 1e-5
+"""A model that is compared with others has converged when a step lowers its cost by less than this share: a tenth of a nat on ten
+thousand readings."""
+
 MAX_HALVINGS = 3
 
 
@@ -64,6 +68,18 @@ class Calibration:
     def network(self) -> Network:
         """The network at its calibrated values."""
         return self.problem.network.with_values(self.problem.values(self.optimum.unknowns))
+
+    @property
+    def log_posterior(self) -> float:
+        """Log-likelihood of the residuals under their own coloured noise, less what priors hold against the parameters.
+
+        Initial temperatures are fitted here: each pays its Schwarz penalty, so that the value stands beside likelihoods
+        that are averaged over them.
+        """
+        mean, std = self.problem.prior()
+        against = 0.5 * float((((self.optimum.unknowns - mean) / std) ** 2).sum())
+        starts = self.problem.n_unknowns - self.problem.n_free
+        return self.whitener.log_likelihood - against - 0.5 * starts * float(np.log(self.problem.n_samples))
 
     @property
     def residuals(self) -> list[FloatArray]:
@@ -249,10 +265,19 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
     """Return the open-loop calibration that starts from a fit in the presence of latent heat.
 
-    ``near`` are optima of the same problem found otherwise: the best of all is kept.
+    ``near`` are optima of the same problem found otherwise: the best of all is kept. It is good enough to be compared.
     """
-    best = min([minimise(fit.problem, fit.unknowns()), *near], key=lambda o: o.fit.cost)
+    best = min([minimise(fit.problem, fit.unknowns(), tolerance=COMPARABLE), *near], key=lambda o: o.fit.cost)
     return Calibration(fit.problem, best, fit_whitener(fit.problem, fit.problem.residuals(best.fit)), max_step_s)
+
+
+def polished(calibration: Calibration) -> Calibration:
+    """Return a calibration that was good enough to be compared, at its optimum."""
+    problem, optimum = calibration.problem, calibration.optimum
+    best = minimise(problem, optimum.unknowns, near=optimum.fit)
+    if not best.fit.cost <= optimum.fit.cost:
+        return calibration
+    return replace(calibration, optimum=best, whitener=fit_whitener(problem, problem.residuals(best.fit)))
 
 
 def _step_error(problem: Problem, finer: Problem) -> float:

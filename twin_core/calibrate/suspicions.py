@@ -54,6 +54,9 @@ QUICK_ROUNDS, ROUNDS = 2, 4
 
 MOST_CLOSE = 6
 
+SAME = 0.95
+"""A misfit that is no smaller than this share of another is the same."""
+
 
 @dataclass(frozen=True)
 class Suspicion:
@@ -320,6 +323,9 @@ def suspicions(
     looked.sort(key=lambda item: item[0])
     found: list[Suspicion] = []
     for _, variant in looked[:MOST_CLOSE]:
+        if found and is_late(deadline):
+            complete = False
+            break
         trial = attempted(partial(_fitted, variant, values or {}, independent), variant.words, [])
         if trial is None or not cost - trial.score > LEAST_GAIN_NATS:
             continue
@@ -366,13 +372,19 @@ def close_words(
     said = [f"{p.name} ended {how_far(p, guesses[p.name])}" for p in far]
     if misfit > MANY_NOISES:
         said.append(f"the misfit is {misfit:.3g} times the sensors' noise")
-    said += [f"perhaps {s.words}: the misfit would be {s.misfit:.3g} times the noise, not {misfit:.3g}" for s in found]
+    said += [f"perhaps {s.words}: {_what_it_would_mend(s, misfit)}" for s in found]
     if complete and not found:
         said.append(
             "no single wrong unit, sign, swapped pair, held value or missing coupling explains it: physics is missing, or"
             " several things are wrong at once"
         )
     return said
+
+
+def _what_it_would_mend(suspicion: Suspicion, misfit: float) -> str:
+    if suspicion.misfit > SAME * misfit:
+        return "the parameters would come nearer to their guesses"
+    return f"the misfit would be {suspicion.misfit:.3g} times the noise, not {misfit:.3g}"
 
 
 def is_odd(parameters: ParameterSet, guesses: dict[str, float], misfit: float) -> bool:

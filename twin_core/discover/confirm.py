@@ -2,21 +2,20 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.calibrate.covariance import gls_covariance
 from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration, from_heat_fit
+from twin_core.calibrate.second_order import COMPARABLE, Calibration, from_heat_fit, sampling_step_s
+from twin_core.discover.once import once
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
 
@@ -34,6 +33,12 @@ MOST_FOLDS = 4
 
 BETWEEN_SESSIONS = 0.5
 """Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to."""
+
+LARGEST_NOISE = 1.5
+"""How much larger than calibration took it to be a sensor's noise may be: from few differences of readings it is known to a
+third."""
+
+LN_2 = float(np.log(2.0))
 
 CONSIDERABLE = 0.1
 """Nodes whose latent heat moves them less than this share of the most moved one say nothing about an effect."""
@@ -63,53 +68,64 @@ class Trial:
     near: tuple[Optimum, ...] = ()
     simpler: "Trial | None" = None
 
-    @cached_property
+    @once
     def calibration(self) -> Calibration:
         """The same model calibrated on open-loop trajectories."""
         near = list(self.near)
         if self.simpler is not None:
             values = self.fit.network.parameters.as_dict()
-            near.append(minimise(self.fit.problem, carried_over(self.simpler.calibration, self.fit.problem, values)))
+            start = carried_over(self.simpler.calibration(), self.fit.problem, values)
+            near.append(minimise(self.fit.problem, start, tolerance=COMPARABLE))
         return from_heat_fit(self.fit, self.max_step_s, near=near)
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:
         """The effects at the values of the open-loop calibration."""
-        return fitted_effects(self.effects, self.calibration.network.parameters.as_dict())
+        return fitted_effects(self.effects, self.calibration().network.parameters.as_dict())
 
-    @cached_property
-    def free_std(self) -> dict[str, float]:
-        """Free parameter -> standard deviation in the solver's coordinate, relative for positive ones."""
-        calibration = self.calibration
-        covariance = gls_covariance(calibration.problem, calibration.optimum, calibration.whitener)
-        names = calibration.problem.network.parameters.free_names
-        return dict(zip(names, np.sqrt(np.diag(covariance)[: len(names)]).tolist(), strict=True))
-
-    @cached_property
+    @once
     def block_errors(self) -> FloatArray:
         """Sum of squared weighted errors on each block predicted from the others, (n_blocks,)."""
-        return blocked_errors(self.calibration)
+        return blocked_errors(self.calibration())
 
-    @cached_property
+    @once
     def forward_error(self) -> float:
         """Sum of squared weighted errors over parts of the training record that a refit has not seen."""
-        return forward_error(self.calibration)
+        return forward_error(self.calibration())
 
-    @cached_property
+    @once
     def misfit_share(self) -> float:
         """Misfit over noise, rms over sensors: how much the open-loop model leaves beyond the sensors' own noise."""
-        models, noise = self.calibration.whitener.models, self.calibration.problem.noise_K
+        models, noise = self.calibration().whitener.models, self.calibration().problem.noise_K
         return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
 
+    @once
+    def log_evidence(self) -> float:
+        """ln of what the readings say for the model, its priors included, in nats.
+
+        What no parameter follows is either heat that wanders at the nodes, or a misfit that wanders at the sensors because a
+        lumped network is coarser than what it describes. Nobody knows beforehand: the mean over both counts, in which the
+        likelier one leads (Hoeting et al. 1999, Bayesian model averaging).
+        """
+        return float(np.logaddexp(self.fit.log_posterior, self.calibration().log_posterior)) - LN_2
+
     @property
-    def excess(self) -> float:
-        """Part of the variance of the open-loop residuals that is beyond the sensor's noise, at the worst sensor."""
-        calibration = self.calibration
-        noise = [
-            min(m.sigma_white, n) for m, n in zip(calibration.whitener.models, calibration.problem.noise_K, strict=True)
-        ]
-        square = np.nanmean((np.concatenate(calibration.residuals) / np.maximum(noise, 1e-300)) ** 2, axis=0)
-        return float(1.0 - 1.0 / max(float(np.nanmax(square)), 1.0))
+    def least_evidence(self) -> float:
+        """What :attr:`log_evidence` is at least, from wandering heat alone: open-loop trajectories need not be computed."""
+        return self.fit.log_posterior - LN_2
+
+    @once
+    def excess(self) -> FloatArray:
+        """Variance of each sensor's open-loop residuals beyond its own noise, in units of that noise, (n_sensors,).
+
+        Noise is what one sample does not tell of the next; more than ``LARGEST_NOISE`` of what calibration took for it is misfit.
+        """
+        calibration = self.calibration()
+        interval_s = sampling_step_s([segment.record for segment in calibration.problem.segments])
+        own = np.array([model.unforeseen(interval_s) for model in calibration.whitener.models])
+        noise = np.maximum(np.minimum(own, LARGEST_NOISE * calibration.problem.noise_K), 1e-300)
+        square = np.nanmean((np.concatenate(calibration.residuals) / noise) ** 2, axis=0)
+        return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
 
     @property
     def n_samples(self) -> int:
@@ -254,7 +270,7 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
     """
     problem = extended(base.fit.problem, effects)
     own = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(base.calibration, problem, own))
+    optimum = minimise(problem, carried_over(base.calibration(), problem, own), tolerance=COMPARABLE)
     if optimum.status == "no_solution":
         return None
     fit = about_trajectory(problem, optimum)
@@ -269,7 +285,7 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     latent heat has taken over a node that nobody reads, only the latter is near), and from the simpler trial's fit: the
     likeliest one counts.
     """
-    calibration = rich.calibration
+    calibration = rich.calibration()
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
     own = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
     along = fit_with_latent_heat(calibration.problem, free, near=rich.fit)
@@ -367,15 +383,10 @@ class Validation:
         return float(np.sqrt(self.ratio * self.forward_ratio))
 
 
-def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return what the likelihood in the presence of latent heat says for the rich trial, chosen among ``n_tried``."""
-    return _evidence(rich.fit.log_posterior - simple.fit.log_posterior, simple, rich, n_tried)
-
-
-def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return what open-loop residuals say for the rich trial, each model under its own coloured residual noise."""
-    gain = rich.calibration.whitener.log_likelihood - simple.calibration.whitener.log_likelihood
-    return _evidence(gain, simple, rich, n_tried)
+def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:
+    """Return what the readings say for the rich trial, chosen among ``n_tried``; with ``quick`` what they say at least."""
+    after = rich.least_evidence if quick else rich.log_evidence()
+    return _evidence(after - simple.log_evidence(), simple, rich, n_tried)
 
 
 def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:
@@ -388,9 +399,9 @@ def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence
 
 def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
-    before, after = simple.block_errors, rich.block_errors
+    before, after = simple.block_errors(), rich.block_errors()
     ratio = float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
-    forward = float(np.sqrt(rich.forward_error / max(simple.forward_error, 1e-300)))
+    forward = float(np.sqrt(rich.forward_error() / max(simple.forward_error(), 1e-300)))
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
@@ -418,7 +429,7 @@ def _latent_rates_K_per_s(fit: HeatFit) -> FloatArray:
 def _removed_share(simple: Trial, rich: Trial) -> float:
     """Return the misfit that the rich trial removes as a share of the spread of the measured temperatures."""
     measured = np.concatenate([s.measured_K for s in simple.fit.problem.segments])
-    before, after = (np.concatenate(t.calibration.residuals) for t in (simple, rich))
+    before, after = (np.concatenate(t.calibration().residuals) for t in (simple, rich))
     removed = float(np.nanmean(before**2) - np.nanmean(after**2))
     spread = float(np.nanmean(np.nanvar(measured, axis=0))) + float(np.mean(simple.fit.problem.noise_K**2))
     return float(np.sqrt(max(removed, 0.0) / spread))

@@ -43,10 +43,10 @@ def effect_heat(search: Search, states_K: FloatArray, first_step: int) -> FloatA
     """
     if not search.findings:
         return None
-    network = search.trial.calibration.network
+    network = search.trial.calibration().network
     forcing = search.trial.fit.problem.segments[-1].forcing
     last = first_step + states_K.shape[0]
-    stages = search.trial.calibration.optimum.fit.trajectories[-1].stages_K[first_step:last].copy()
+    stages = search.trial.calibration().optimum.fit.trajectories[-1].stages_K[first_step:last].copy()
     declared = search.base.fit.problem.n_nodes
     stages[:, :, :declared] = states_K[:, None, :]
     boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(first_step, last))

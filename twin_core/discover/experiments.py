@@ -123,7 +123,7 @@ def separating(finding: Finding) -> list[Experiment]:
         return []
     trials = [option.trial for option in options]
     weights = softmax([option.evidence.log_bayes_factor for option in options])
-    own = trials[0].calibration
+    own = trials[0].calibration()
     record = own.problem.segments[-1].record
     flown = []
     for plan in plans(own.problem.network.spec, record):
@@ -213,7 +213,7 @@ class _Flight:
     @classmethod
     def of(cls, trial: Trial, record: Record) -> "_Flight":
         """Fly a stretch."""
-        calibration = trial.calibration
+        calibration = trial.calibration()
         before, network = calibration.problem, calibration.network
         problem = build_problem(network, [record], before.noise_K, trial.max_step_s)
         unknowns = calibration.optimum.unknowns
@@ -245,7 +245,7 @@ class _Flight:
 
 def _covariance(trial: Trial) -> FloatArray:
     """Return the covariance of the free parameters and of the last segment's initial temperatures."""
-    calibration = trial.calibration
+    calibration = trial.calibration()
     problem = calibration.problem
     full = gls_covariance(problem, calibration.optimum, calibration.whitener)
     columns = np.r_[0 : problem.n_free, problem.start_columns(len(problem.segments) - 1)]

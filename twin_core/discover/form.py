@@ -30,8 +30,8 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
         Log Bayes factor up to which what is left does not count.
     """
     best, n_tried = _free_forms(trial, effects, needed)
-    tops = (try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS])
-    return any(weigh(trial, top, n_tried).log_bayes_factor > most for top in tops)
+    tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
+    return any(weigh(trial, top, n_tried).log_bayes_factor > most for top in _likeliest(trial, tops))
 
 
 def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> bool:
@@ -48,8 +48,13 @@ def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect
         As in :func:`leaves_a_repeatable_heat`.
     """
     best, _ = _free_forms(simple, effects, needed)
-    instead = (try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS])
-    return any(weigh(rival, trial, 1).log_bayes_factor < -most for rival in instead)
+    instead = [try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS]]
+    return any(weigh(rival, trial, 1).log_bayes_factor < -most for rival in _likeliest(simple, instead))
+
+
+def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
+    """Return the likeliest option beside wandering heat, alone: weighing one in full takes open-loop trajectories."""
+    return sorted(options, key=lambda trial: -weigh(simple, trial, 1, quick=True).log_bayes_factor)[:1]
 
 
 def _free_forms(trial: Trial, effects: Sequence[Effect], needed: float) -> tuple[list[Effect], int]:

@@ -28,6 +28,7 @@ UNEXPLAINED_SHARE = 1.0
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
 NO_MODEL = "the corrected model could not be computed"
+NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
 REPEATABLE_SHARE = 0.1
@@ -57,6 +58,8 @@ class Finding:
 
     judged: Judged
     alternatives: tuple[Judged, ...] = ()
+    explained: float = np.inf
+    """Variance of open-loop residuals that they explain, in units of the sensors' noise, mean over sensors."""
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -117,9 +120,12 @@ class Search:
         self.n_named = max(self.n_named, fork.n_named)
 
     def attempt(self, work: Callable[[], T], what: str) -> T | None:
-        """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``."""
+        """Return what ``work`` returns; None where it fails numerically or time is up, which is kept under ``what``.
+
+        A candidate whose values run away is as unlikely as can be: NumPy's warnings on the way are nobody's business.
+        """
         try:
-            with limited(self.deadline):
+            with limited(self.deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 check_time()
                 return attempted(work, what, self.failures)
         except TimeIsUpError:
@@ -160,8 +166,9 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             elsewhere = [
                 j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
             ]
+            close = tuple(j for j in elsewhere if is_close(j, best))
+            state.findings.append(Finding(own, close, mean_excess(state.trial) - mean_excess(best.trial)))
             state.trial = best.trial
-            state.findings.append(Finding(own, tuple(j for j in elsewhere if is_close(j, best))))
             state.rejected += refused
             return True
     state.rejected += [*refused, *weak]
@@ -190,6 +197,11 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
 def most_left(log_bayes_factor: float, needed: float) -> float:
     """Return how much evidence a repeatable heat beside a name may have, given that of the name."""
     return max(needed, REPEATABLE_SHARE * log_bayes_factor)
+
+
+def mean_excess(trial: Trial) -> float:
+    """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
+    return float(np.mean(trial.excess()))
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

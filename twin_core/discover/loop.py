@@ -13,10 +13,11 @@ from twin_core.calibrate.containment import NO_DEADLINE, attempted
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network, to_model
-from twin_core.discover.confirm import Trial
+from twin_core.calibrate.second_order import fit_network, polished, to_model
+from twin_core.discover.confirm import Trial, fitted_effects
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
+from twin_core.discover.mistakes import told_mistakes
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
@@ -141,6 +142,7 @@ def _close_loop(
     progress(0.93, "drawing")
     witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)
+    report |= told_mistakes(found, report, deadline=latest)
     plots = build_plots(found, before, after, held, predictions, report, witness)
     report["quality"] = quality_json([*records, *holdout_records])
     plots["quality_strip"] = quality_strip([*records, *holdout_records])
@@ -161,7 +163,9 @@ def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
 
 def corrected(found: Search) -> CalibratedModel:
     """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
-    return centred(to_model(found.trial.calibration, found.trial.present_effects), found.trial.fit)
+    calibration = polished(found.trial.calibration())
+    effects = fitted_effects(found.trial.effects, calibration.network.parameters.as_dict())
+    return centred(to_model(calibration, effects), found.trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:
@@ -193,6 +197,16 @@ def _split(
         raise TelemetryError(
             f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
         )
+    given = {b.channel for b in spec.boundaries.values() if b.channel is not None} | {
+        load.channel for load in spec.loads
+    }
+    for part in (part for h in held for part in (h.lead, h.scored)):
+        for name in sorted(given & part.values.keys()):
+            if not np.isfinite(part.values[name]).any():
+                raise TelemetryError(
+                    f"{part.name}: channel '{name}' has no samples in the hold-out, and the model needs it as an input;"
+                    " choose another hold-out, or give them"
+                )
     return train, held
 
 
@@ -200,5 +214,5 @@ def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    unexplained = found.base.misfit_share > UNEXPLAINED_SHARE
+    unexplained = found.base.misfit_share() > UNEXPLAINED_SHARE
     return "unexplained" if unexplained else "no_effect_supported"

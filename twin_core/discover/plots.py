@@ -75,7 +75,7 @@ def _temperatures(
     segment = search.base.fit.problem.segments[-1]
     follows = held[0].lead.time_s[0] == segment.record.time_s[0]
     sensors = search.base.fit.problem.network.spec.sensors
-    fits = [trial.calibration.optimum.fit.predicted_K[-1] for trial in (search.base, search.trial)]
+    fits = [trial.calibration().optimum.fit.predicted_K[-1] for trial in (search.base, search.trial)]
     times, measured = [p.time_s for p in predictions[0]], [p.measured_K for p in predictions[0]]
     modelled = [[p.predicted_K for p in ps] for ps in predictions]
     if follows:

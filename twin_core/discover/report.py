@@ -217,8 +217,8 @@ def build_report(
             for judged in best_rejected(search)[:8]
         ],
         "unexplained_share": {
-            "before": unexplained_share(search.base.calibration),
-            "after": unexplained_share(search.trial.calibration),
+            "before": unexplained_share(search.base.calibration()),
+            "after": unexplained_share(search.trial.calibration()),
         },
         "parameters": parameter_rows(search, before, after),
         "failures": list(dict.fromkeys(search.failures)),

@@ -13,7 +13,7 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
-from twin_core.discover.judge import Judged, Search, accept, once_each, threshold, worth
+from twin_core.discover.judge import NO_MORE, Judged, Search, accept, mean_excess, once_each, threshold, worth
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
@@ -37,7 +37,18 @@ DOUBTFUL = 0.8
 """Foresight from which a finding of the innovations is held against what open-loop residuals suggest: the better one counts."""
 
 LEAST_EXCESS = 0.1
-"""Part of the variance of open-loop residuals that must be beyond the noise, at one sensor at least: else nothing is missing."""
+"""Variance of open-loop residuals beyond the noise, in units of that noise, at one sensor at least: else nothing is missing."""
+
+DOMINANCE = 3.0
+"""A name must explain so many times the variance that stays unexplained, as far as a lumped network may leave that."""
+
+COARSEST = 4.0
+"""Variance, in units of the sensors' noise, up to which what stays unexplained may be a lumped network's coarseness: a misfit
+of two noises."""
+
+WIDENED = 1.0
+"""Variance, in units of the sensors' noise, that must stay unexplained beside a finding for pairs and trajectories to be
+asked as well: the coarseness of a lumped network is as large."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -74,26 +85,29 @@ def search(
         if not _extend(state, needed, fallback=False):
             break
         prune(state, needed)
+    withdraw(state)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
+        withdraw(state)
     return state
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: state.trial.excess < LEAST_EXCESS, "how well trajectories fit"):
+    if state.attempt(lambda: bool(state.trial.excess().max() < LEAST_EXCESS), "how well trajectories fit"):
         return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
+    widened = not state.findings or mean_excess(state.trial) > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
-    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
+    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if told and by_heat.findings[-1].foresight < DOUBTFUL:
+    if not widened or (told and by_heat.findings[-1].foresight < DOUBTFUL):
         state.join(by_heat)
-        return True
+        return bool(told)
     second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback)
     seen = state.attempt(second, f"{what}, by open-loop residuals")
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
@@ -104,8 +118,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     return True
 
 
-def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
-    """Extend by what the innovations say, in the presence of latent heat."""
+def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool) -> bool:
+    """Extend by what the innovations say, in the presence of latent heat; by ``pairs`` where no single effect is supported."""
     screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
@@ -117,8 +131,8 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> bool:
     singles = [(effect,) for effect in chosen]
     if accept(state, _by_heat(state, singles, n_tried), needed):
         return True
-    pairs = [] if fallback else _best_pairs(rankings[0], state.trial, needed)
-    return accept(state, _by_heat(state, pairs, max(n_tried**2 // 2, 1)), needed)
+    both = _best_pairs(rankings[0], state.trial, needed) if pairs and not fallback else []
+    return accept(state, _by_heat(state, both, max(n_tried**2 // 2, 1)), needed)
 
 
 def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:
@@ -198,7 +212,29 @@ def _judge(
         try_effects(start, (*state.trial.effects, *option), n_passes=n_passes, quick=quick), simpler=state.trial
     )
     found = trial.effects[len(state.trial.effects) :]
-    return Judged(found, weigh(state.trial, trial, n_tried), trial)
+    return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)
+
+
+def withdraw(state: Search) -> None:
+    """Withdraw findings that explain no more than what stays unexplained: both may be what a lumped network cannot follow.
+
+    Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
+    counts as unexplained.
+    """
+    while state.findings:
+        left = DOMINANCE * min(mean_excess(state.trial), COARSEST)
+        weakest = min(state.findings, key=lambda finding: finding.explained)
+        if weakest.explained >= left:
+            return
+        state.findings = [finding for finding in state.findings if finding is not weakest]
+        state.rejected.append(replace(weakest.judged, reason=NO_MORE))
+        places = {effect.place for effect in weakest.effects}
+        others = [effect for effect in state.trial.effects if effect.place not in places]
+        work = partial(try_effects, state.trial, others, n_passes=10)
+        kept = state.attempt(work, "the model without what explains no more than what stays") if others else state.base
+        if kept is None:
+            state.findings, kept = [], state.base
+        state.trial = kept
 
 
 def prune(state: Search, needed: float) -> None:

@@ -1,12 +1,10 @@
 """The second look, at open-loop trajectories: where misfit is too large for the innovations to lead the way.
 
-Long trajectories forgive effects that merely resemble what is missing, so what they suggest must be supported by the
-innovations too: once, for one set of effects, not for one among many. Where the likeliest set does not hold, another one
-that the trajectories like less is no better a name.
+What long trajectories suggest is weighed as everything else is: against heat that wanders at the nodes, and against a misfit
+that wanders at the sensors.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from math import comb
 
@@ -15,9 +13,9 @@ from twin_core.discover.confirm import (
     about_trajectory,
     resettled,
     try_on_trajectories,
-    weigh_trajectories,
+    weigh,
 )
-from twin_core.discover.judge import Judged, Search, accept, is_close, once_each
+from twin_core.discover.judge import Judged, Search, accept, once_each
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.effects.base import Effect
 
@@ -31,9 +29,8 @@ MOST_TOGETHER = 2
 LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
 
-NOT_BY_BOTH = "open-loop residuals suggest it, the filter's innovations do not support it"
-N_KEPT = 4
-"""Sets of effects that are extended by one more."""
+N_KEPT, N_SETTLED = 4, 2
+"""Sets of effects that are extended by one more, and that are fitted in the presence of undeclared heat too."""
 
 
 def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
@@ -48,7 +45,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
     fallback
         Whether to try the effects without a name.
     """
-    misfit = state.trial.misfit_share
+    misfit = state.trial.misfit_share()
     if misfit < LEAST_MISFIT_SHARE:
         return False
     seeds = [state.trial]
@@ -57,10 +54,8 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
         sets = once_each(judged)[:N_KEPT]
         if not sets:
             break
-        state.rejected += [replace(j, reason=NOT_BY_BOTH) for j in sets]
-        if accept(state, _supported(state, sets if fallback else sets[:1], needed), needed):
-            close = tuple(j for j in sets[1:] if is_close(j, sets[0]))
-            state.findings[-1] = replace(state.findings[-1], alternatives=close)
+        n_tried = comb(state.n_named, n_together)
+        if accept(state, [*_settled(state, sets[:N_SETTLED], n_tried, needed), *sets], needed):
             return True
         seeds = [j.trial for j in sets]
     return False
@@ -68,7 +63,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
 
 def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fallback: bool) -> list[Judged]:
     """Return what one more effect makes of a trial, judged against the state's model."""
-    calibration = seed.calibration
+    calibration = seed.calibration()
     fit = about_trajectory(calibration.problem, calibration.optimum)
     screenings = screened(seed, fit, LATENT_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
@@ -85,16 +80,20 @@ def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged 
     trial = try_on_trajectories(seed, (*seed.present_effects, effect))
     if trial is None:
         return None
-    evidence = weigh_trajectories(state.trial, trial, n_tried)
-    return Judged(trial.effects[len(state.trial.effects) :], evidence, trial)
+    return _judged(state, trial, n_tried)
 
 
-def _supported(state: Search, options: Sequence[Judged], needed: float) -> list[Judged]:
-    """Return the options that the innovations make likelier too, with their parameters fitted to these.
+def _judged(state: Search, trial: Trial, n_tried: int) -> Judged:
+    """Return what speaks for a trial on top of the state's model."""
+    return Judged(trial.effects[len(state.trial.effects) :], weigh(state.trial, trial, n_tried), trial)
 
-    The freedom of an option has been paid for where it was chosen, on trajectories.
-    """
+
+def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: float) -> list[Judged]:
+    """Return the options that are likely, with their parameters fitted in the presence of undeclared heat too."""
+
+    def settled(judged: Judged) -> Judged:
+        return _judged(state, resettled(state.trial, judged.trial), n_tried)
+
     likely = [j for j in options if j.evidence.log_bayes_factor > needed]
-    trials = [state.attempt(partial(resettled, state.trial, j.trial), f"{j.labels} on trajectories") for j in likely]
-    settled = [replace(j, trial=trial) for j, trial in zip(likely, trials, strict=True) if trial is not None]
-    return [j for j in settled if j.trial.fit.log_posterior - state.trial.fit.log_posterior > needed]
+    done = [state.attempt(partial(settled, j), f"{j.labels} on trajectories") for j in likely]
+    return [j for j in done if j is not None]

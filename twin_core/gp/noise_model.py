@@ -46,6 +46,10 @@ class ResidualNoise:
     sigma_white: float
     log_likelihood: float
 
+    def unforeseen(self, interval_s: float) -> float:
+        """Return the standard deviation of what the coloured part one interval earlier does not tell of the residual."""
+        return float(np.sqrt(self.sigma_white**2 - self.sigma_ou**2 * np.expm1(-2.0 * interval_s / self.length_s)))
+
     def whiten(self, time_s: FloatArray, columns: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
         """Apply L⁻¹ to columns, L Lᵀ being this noise's covariance at the valid samples.
 

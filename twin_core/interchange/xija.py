@@ -24,6 +24,9 @@ FIRST_METHOD, FIRST_METHOD_MORE = 1.5, 0.625
 one: y_2 = y_0 + h f_0 / 2 + h f_1. Its temperatures move 1.5 times as fast as its time constants say, and a rate z per step
 makes 1.5 z + 0.625 z^2 of it, to second order. Models are fitted with it, so that this is what they mean."""
 
+FITTED_SPREAD, LEAST_SPREAD_W = 1.1, 0.05
+"""How far off a fit of years of telemetry is taken to be, unless the user says so, as a factor; and for a table of zeros."""
+
 YEAR_DAYS = 365.3
 """Xija's year, a tenth of 2000 to 2010."""
 
@@ -113,6 +116,7 @@ class _Writer:
     measured: Mapping[str, str]
     constant: Mapping[str, float]
     held: bool
+    spread: float
     speed: Mapping[str, float]
     boundaries: Data = field(default_factory=dict)
     channels: Data = field(default_factory=dict)
@@ -133,7 +137,8 @@ class _Writer:
         return "guess" if not self.held and component.free & set(pars) else "value"
 
     def quantity(self, component: Component, value: float, *pars: str) -> Data:
-        return {self.key(component, *pars): number(value)}
+        key = self.key(component, *pars)
+        return {key: number(value)} | ({"spread": self.spread} if key == "guess" else {})
 
     def channel(self, name: str, *, levels: bool = False, unit: str | None = None) -> str:
         """Return the name of an auxiliary channel, declared once; a constant where the user says so."""
@@ -173,7 +178,7 @@ class _Writer:
         key = "values_W" if known else "guess_W"
         table: Data = {"knots": [float(k) for k in knots], key: scaled}
         if not known:
-            table["spread_W"] = number(max(0.3 * max(map(abs, scaled)), 0.05))
+            table["spread_W"] = number(max((self.spread - 1.0) * max(map(abs, scaled)), LEAST_SPREAD_W))
         load: Data = {"channel": channel, "node": name_of(node), "table": table}
         self._add({**load, "factor": factor} if factor is not None else load, component)
 
@@ -208,6 +213,7 @@ def read_xija(
     constants: Mapping[str, float] | None = None,
     hidden: Sequence[str] = (),
     held: bool = False,
+    spread: float = FITTED_SPREAD,
 ) -> Imported:
     """Return a Xija model as a specification.
 
@@ -226,6 +232,8 @@ def read_xija(
         Nodes whose telemetry is not there.
     held
         Take every parameter as known; by default those that Xija does not freeze are calibrated.
+    spread
+        The factor by which what was fitted before may be off, one standard deviation; of a sink the same share of 100 K.
 
     Raises
     ------
@@ -245,7 +253,7 @@ def read_xija(
             known = ", ".join(sorted(n for n in names if n))
             raise SpecError(f"{source}: has no component '{name}' (it has {known})")
     speed = _speeds(model, components)
-    write = _Writer(source, _capacities(components), channels or {}, constants or {}, held, speed)
+    write = _Writer(source, _capacities(components), channels or {}, constants or {}, held, spread, speed)
     for component in components:
         translate = _TRANSLATORS.get(component.kind)
         try:
@@ -520,6 +528,8 @@ def _heat_sink(write: _Writer, component: Component) -> None:
     if sink_C < -ZERO_CELSIUS_K:
         raise _UnknownError(f"has a sink of {sink_C:.0f} degC, below absolute zero")
     write.boundaries[name] = {key: number(sink_C + ZERO_CELSIUS_K)}
+    if key == "guess_K":
+        write.boundaries[name]["spread"] = number(100.0 * (write.spread - 1.0))
     conductance = write.quantity(component, write.scale[node] / tau, "tau")
     write.conductors.append({"between": [name_of(node), name], "conductance_W_per_K": conductance})
 

@@ -190,8 +190,7 @@ def free_entries(
         told = [(*parameters.ties.get(row.item, (row.item, 1.0)), row) for row in rows]
         rows = [Entry(item, row.node, size * row.series) for item, size, row in told]
     kept = [row for row in rows if row.item in position]
-    at = parameters.at_values(values)
-    slopes = {item: at.parameters[item].transform.slope(at.parameters[item].free) for item in {r.item for r in kept}}
+    slopes = {item: parameters.slope(item, float(values[item])) for item in {r.item for r in kept}}
     series = np.array([slopes[row.item] * row.series for row in kept]).reshape(len(kept), n_points)
     free = np.array([position[row.item] for row in kept], dtype=np.int64)
     node = np.array([row.node for row in kept], dtype=np.int64)

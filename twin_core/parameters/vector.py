@@ -88,6 +88,11 @@ class ParameterSet:
         """Longest steps of the free vector at once, (n_free,); infinite where any will do."""
         return np.array([self.parameters[i].transform.leap for i in self.free_index], dtype=np.float64)
 
+    def slope(self, index: int, value: float) -> float:
+        """Return d value / d free of one parameter where its physical value is ``value``."""
+        transform = self.parameters[index].transform
+        return float(transform.slope(transform.to_free(value)))
+
     def to_values(self, free: FloatArray) -> FloatArray:
         """Return all physical values, (n_parameters,), for a free vector (n_free,)."""
         values = self.values

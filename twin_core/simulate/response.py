@@ -16,6 +16,7 @@ from twin_core.network.model import Network
 from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.simulate.derivatives import march_sensitivities
 from twin_core.simulate.forcing import Forcing
+from twin_core.simulate.large import MANY, march_sensitivities_of_many
 from twin_core.simulate.modes import Modes
 from twin_core.simulate.one_step import take_steps
 from twin_core.simulate.relays import N_KICK, NO_RELAYS, Relays
@@ -144,8 +145,8 @@ class _Switched:
         parameters = self.split.network.parameters
         shared, size = parameters.ties.get(index, (index, 1.0))
         found = np.flatnonzero(parameters.free_index == shared)
-        parameter = parameters.at_values(self.split.values).parameters[shared]
-        return (int(found[0]), size * parameter.transform.slope(parameter.free)) if found.size else (-1, 0.0)
+        slope = parameters.slope(shared, float(self.split.values[shared]))
+        return (int(found[0]), size * slope) if found.size else (-1, 0.0)
 
     @cached_property
     def _powers(self) -> list[tuple[int, float]]:
@@ -245,25 +246,19 @@ def _march(
     """Carry columns of enthalpy (n_nodes, n_columns) through steps; return those of the samples' temperatures, the end's."""
     column, node, series = entries
     shape = (step_s.size, 2, state.shape[0])
-    block, end = march_sensitivities(
+    along = (
         step_s,
         split.modes,
         *less_modes(balance.jacobian, split.slope_W_per_K, balance.own_J_per_K),
         split.stages,
         (balance.heat_W / balance.own_J_per_K).reshape(shape),
-        split.relays,
-        split.kicks,
-        split.relay_column,
-        split.relay_slope,
-        split.turned,
-        split.turns,
-        column,
-        node,
-        series.reshape(column.size, step_s.size, 2),
-        state,
-        sample_step,
-        observed,
     )
+    switched = (split.relays, split.kicks, split.relay_column, split.relay_slope)
+    columns = (split.turned, split.turns, column, node, series.reshape(column.size, step_s.size, 2))
+    if state.shape[0] >= MANY and split.relays.node.size == 0:
+        block, end = march_sensitivities_of_many(*along, *columns, state, sample_step, observed)
+    else:
+        block, end = march_sensitivities(*along, *switched, *columns, state, sample_step, observed)
     if balance.moves:
         slope = np.concatenate([begin_slope, balance.slope[1::2]])
         block *= slope[sample_step][:, observed, None]

@@ -318,7 +318,6 @@ def turning(
     parameters, own = network.parameters, values[network.capacity_index]
     slope = split.slope_W_per_K(about_K)
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
-    at = parameters.at_values(values)
     along = probe(network, values, forcing, about_K)
     found: dict[int, FloatArray] = {}
     for number, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
@@ -326,26 +325,24 @@ def turning(
             continue
         for item, parameter in enumerate(index.tolist()):
             shared, size = parameters.ties.get(parameter, (parameter, 1.0))
-            if shared not in position:
+            if shared not in position or isinstance(term, ChannelLoad | TableLoad):
                 continue
-            change = np.zeros_like(slope)
-            if isinstance(term, Conductors):  # by far the most, and linear
+            change = found.setdefault(shared, np.zeros_like(slope))
+            if isinstance(term, Conductors | NodeRadiation):  # by far the most, and told by their pairs
                 a, b = term.pairs[item]
-                change[[a, a, b, b], [a, b, a, b]] = (-1.0, 1.0, 1.0, -1.0)
-            elif isinstance(term, NodeRadiation):
-                a, b = term.pairs[item]
-                unit = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * about_K[[a, b]] ** 3
-                change[[a, a, b, b], [a, b, a, b]] = (-unit[0], unit[1], unit[0], -unit[1])
-            elif not isinstance(term, ChannelLoad | TableLoad):
-                step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
-                for sign in (1.0, -1.0):
-                    moved = values[index].copy()
-                    moved[item] += sign * step
-                    part = term.evaluate(along, moved)
-                    block = np.ix_(part.nodes, part.nodes)
-                    change[block] += sign / (2.0 * step) * part.d_temperature[0]
-            if change.any():
-                found[shared] = found.get(shared, 0.0) + size * symmetric(change, slope)
+                unit = np.ones(2)
+                if isinstance(term, NodeRadiation):
+                    unit = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * about_K[[a, b]] ** 3
+                change[[a, a, b, b], [a, b, a, b]] += size * np.array([-unit[0], unit[1], unit[0], -unit[1]])
+                continue
+            step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
+            for sign in (1.0, -1.0):
+                moved = values[index].copy()
+                moved[item] += sign * step
+                part = term.evaluate(along, moved)
+                block = np.ix_(part.nodes, part.nodes)
+                change[block] += size * sign / (2.0 * step) * part.d_temperature[0]
+    found = {shared: symmetric(change, slope) for shared, change in found.items() if change.any()}
     mine = symmetric(slope)
     for node, parameter in enumerate(network.capacity_index.tolist()):
         shared, size = parameters.ties.get(parameter, (parameter, 1.0))
@@ -354,6 +351,6 @@ def turning(
             change[node] = -size * mine[node] / own[node]
             found[shared] = found.get(shared, 0.0) + change
     turned = np.array([position[p] for p in found], dtype=np.int64)
-    slopes = [at.parameters[p].transform.slope(at.parameters[p].free) for p in found]
+    slopes = [parameters.slope(p, float(values[p])) for p in found]
     n = own.size
     return turned, np.array([s * change for s, change in zip(slopes, found.values(), strict=True)]).reshape(-1, n, n)

@@ -23,6 +23,7 @@ def test_the_commands() -> None:
             "check-effect",
             "close-loop",
             "demo",
+            "export",
             "forecast",
             "import",
             "init",

@@ -71,10 +71,10 @@ def test_promised_separation_is_what_scipy_integrates(finding: Finding) -> None:
     power = np.where(TIMES >= TIMES[-1] - 5970.0, 0.0, finding.judged.trial.fit.problem.segments[0].record.values["Q"])
     paths = []
     for judged in (finding.judged, finding.alternatives[0]):
-        values = judged.trial.calibration.network.parameters.as_dict()
+        values = judged.trial.calibration().network.parameters.as_dict()
         leak = values.get("leak_to_boundary(a,room).G_W_per_K", 0.0)
         heat = values.get("constant_heat_load(a).Q_W", 0.0)
-        start = float(judged.trial.calibration.optimum.fit.trajectories[0].start_K[0])
+        start = float(judged.trial.calibration().optimum.fit.trajectories[0].start_K[0])
         paths.append(readings(power, start, leak, heat))
     assert off.apart_K == pytest.approx(np.sqrt(np.mean((paths[0] - paths[1]) ** 2)), rel=5e-3)
     assert off.apart_std == pytest.approx(off.apart_K / NOISE_K)

@@ -93,9 +93,23 @@ def test_a_single_node_gets_an_answer() -> None:
     [
         (PAIR, {"T1": np.where(LATE, readings()["T1"], np.nan)}, "channel 'T1' has no usable samples"),
         (PAIR, {"Q": np.where(LATE, 10.0, np.nan)}, "channel 'Q' has no samples"),
+        (PAIR, {"Q": np.where(np.arange(N_TIMES) < 60, 10.0, np.nan)}, "channel 'Q' has no samples in the hold-out"),
         (edited(exclude=[{"start": 0.0, "stop": 1e9}]), {}, "no usable sample of T0, T1"),
     ],
 )
 def test_what_cannot_be_used_is_named(data: dict[str, Any], more: dict[str, np.ndarray], message: str) -> None:
     with pytest.raises(TelemetryError, match=message):
         close_loop(load_spec(data), [record(**more)])
+
+
+def test_a_wrong_unit_is_told_whatever_physics_would_stand_for_it() -> None:
+    """One sensor reads K and is taken for degC: no effect of the vocabulary may stand there unchallenged."""
+    report = close_loop(load_spec(PAIR), [record(T0=readings()["T0"] + 273.15)], deadline_s=60.0).report
+    told = [row for row in report["suspicions"] if row["mistake"] == "unit"]
+    assert told and told[0]["where"] == ["T0"]
+    assert told[0]["misfit"] < 2.0
+    assert report["notices"][0].startswith("perhaps channel 'T0' is in K, not in degC")
+
+
+def test_nothing_is_suspected_where_the_model_suffices() -> None:
+    assert close_loop(load_spec(PAIR), [record()]).report["suspicions"] == []

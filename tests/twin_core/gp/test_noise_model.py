@@ -121,3 +121,12 @@ def test_whitening_refuses_what_it_cannot_use():
         ResidualNoise(0.0, 1.0, 0.0, 0.0).whiten(np.arange(2.0), ones, valid)
     with pytest.raises(ModelError, match="valid sample is not finite"):
         ResidualNoise(0.0, 1.0, 1.0, 0.0).whiten(np.arange(2.0), ones * np.nan, valid)
+
+
+@pytest.mark.parametrize("interval_s", [1.0, 60.0, 1e5])
+def test_what_the_coloured_part_one_interval_earlier_does_not_tell(interval_s):
+    """The conditional variance of two jointly normal variables: coloured part at t, residual at t + interval."""
+    noise = ResidualNoise(0.3, 90.0, 0.1, 0.0)
+    shared = noise.sigma_ou**2 * np.exp(-interval_s / noise.length_s)
+    conditional = noise.sigma_ou**2 + noise.sigma_white**2 - shared**2 / noise.sigma_ou**2
+    assert noise.unforeseen(interval_s) ** 2 == pytest.approx(conditional)

@@ -1,0 +1,238 @@
+"""What a large archive costs: jobs, memory, answers, exports, residuals on disk, deletion, a vast specification.
+
+A million frames of twelve channels, sampled once a second, are ingested by a real server process; then each figure of
+``docs/service.md#room`` is taken. ``python -m benchmarks.service_years [--frames N]`` writes
+``benchmarks/tables/service_years.md``.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import sqlite3
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+import benchmarks.service_life as life
+from benchmarks.markdown import markdown_table, save_table
+from benchmarks.service import post_all, running
+from service.client import TwinClient
+from service.jobs.executor import resident_MiB
+
+Row = list[str]
+PIECE = 2000
+N_NODES = 11
+
+
+def frames(count: int) -> Iterator[bytes]:
+    """Yield bodies with samples of a chain of nodes, a second apart: a day that repeats, with noise of its own."""
+    life.N_NODES, life.STEP_S = N_NODES, 60.0
+    _, values = life.orbits(1500)
+    generator = np.random.default_rng(3)
+    minutes = np.arange(1500) * 60.0
+    for first in range(0, count, PIECE):
+        second = np.arange(first, min(first + PIECE, count))
+        made = {"Q": np.interp(second % 84_000, minutes, values["Q"]).round(1).tolist()}
+        for k in range(N_NODES):
+            smooth = np.interp(second % 84_000, minutes, values[f"T_n{k}"])
+            made[f"T_n{k}"] = (smooth + generator.normal(0.0, 0.05, second.size)).round(3).tolist()
+        yield json.dumps({"time": second.tolist(), "values": made}).encode()
+
+
+@contextlib.contextmanager
+def stalls(url: str) -> Iterator[list[float]]:
+    """Yield the latencies in seconds of a small request that is sent again and again meanwhile."""
+    done, found = threading.Event(), []
+
+    def ask() -> None:
+        with httpx.Client(base_url=url, trust_env=False, timeout=60.0) as http:
+            while not done.is_set():
+                begun_s = time.perf_counter()
+                http.get("/readyz")
+                found.append(time.perf_counter() - begun_s)
+                time.sleep(0.005)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield found
+    finally:
+        done.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def most_memory(folder: Path) -> Iterator[dict[str, float]]:
+    """Yield the greatest memory in MiB of the server and of a worker, and the CPU seconds of the busiest job, by the end."""
+    done, found = threading.Event(), {"server": 0.0, "worker": 0.0, "cpu_s": 0.0}
+    tick_s = 1.0 / os.sysconf("SC_CLK_TCK")
+
+    def look() -> None:
+        while not done.wait(0.1):
+            for entry in Path("/proc").iterdir():
+                with contextlib.suppress(OSError, ValueError):
+                    if str(folder).encode() not in (entry / "environ").read_bytes():
+                        continue
+                    what = "server" if b"-m\0service" in (entry / "cmdline").read_bytes() else "worker"
+                    found[what] = max(found[what], resident_MiB(int(entry.name)))
+                    spent = (entry / "stat").read_text().rpartition(")")[2].split()
+                    if int(spent[16]) > 0:  # of lower priority: a job
+                        found["cpu_s"] = max(found["cpu_s"], (int(spent[11]) + int(spent[12])) * tick_s)
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        yield found
+    finally:
+        done.set()
+        thread.join()
+
+
+def job(client: TwinClient, folder: Path, kind: str, target: str, **settings: Any) -> Row:
+    """Measure one job."""
+    begun_s = time.perf_counter()
+    with most_memory(folder) as memory:
+        start = client.calibrate if kind == "calibration" else client.diagnose
+        made = client.wait("chain", start("chain", **settings))
+    assert made.state == "succeeded", made.message
+    said = made.message.partition("; from ")[2]
+    took_s = time.perf_counter() - begun_s
+    took = f"{took_s:.0f} s ({memory['cpu_s']:.0f} s of computing), {memory['worker']:.0f} MiB in its process"
+    return [f"{kind} {settings or ''}: {said}", took, target]
+
+
+def size_MB(path: Path, query: str) -> float:
+    """Return what a query of the store sums up, in megabytes."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return float(connection.execute(query).fetchone()[0] or 0) / 1e6
+
+
+def answers(url: str, folder: Path) -> list[Row]:
+    """Measure default answers and exports."""
+    rows = []
+    for what in ("telemetry", "residuals"):
+        begun_s = time.perf_counter()
+        length = len(httpx.get(f"{url}/v1/twins/chain/{what}", timeout=120.0).content)
+        took_s = time.perf_counter() - begun_s
+        rows.append([f"default answer of {what}", f"{length / 1e6:.1f} MB in {took_s:.1f} s", "bounded"])
+    for form in ("csv", "parquet"):
+        begun_s = time.perf_counter()
+        with most_memory(folder) as memory, stalls(url) as latencies_s:
+            length = 0
+            with httpx.stream("GET", f"{url}/v1/twins/chain/telemetry/export?format={form}", timeout=600.0) as answer:
+                for piece in answer.iter_raw():
+                    length += len(piece)
+        took_s = time.perf_counter() - begun_s
+        stall = f"longest stall {1e3 * max(latencies_s):.0f} ms"
+        figures = f"{length / 1e6:.0f} MB in {took_s:.0f} s, server at {memory['server']:.0f} MiB, {stall}"
+        rows.append([f"whole archive as {form}", figures, "streamed"])
+    return rows
+
+
+def vast(url: str) -> Row:
+    """Measure what a specification of ten thousand nodes, which is refused, and one of two thousand do to others."""
+    figures = []
+    for count in (10_000, 2000):
+        names = [f"T_{k:05d}_of_a_large_spacecraft" for k in range(count)]
+        spec = {
+            "twin": f"vast-{count}",
+            "channels": {name: {"kind": "temperature", "unit": "K"} for name in names},
+            "nodes": [{"id": f"n{k}", "sensor": name} for k, name in enumerate(names)],
+        }
+        with stalls(url) as latencies_s:
+            status = httpx.post(f"{url}/v1/twins", json=spec, timeout=120.0).status_code
+        figures.append(f"{count:,} nodes: {status}, longest stall {1e3 * max(latencies_s):.0f} ms")
+    return ["a vast specification", "; ".join(figures), "no stall of seconds"]
+
+
+class _Told(list[Row]):
+    """Rows that are printed as they come."""
+
+    def append(self, row: Row) -> None:
+        print(" | ".join(row), flush=True)
+        super().append(row)
+
+
+def main() -> None:
+    """Run the benchmark from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=1_000_000)
+    parser.add_argument("--without-diagnosis", action="store_true", help="leave out what takes longest")
+    given = parser.parse_args()
+    count = given.frames
+    load = os.getloadavg()[0]
+    rows = _Told()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = folder / "bench.sqlite3"
+        with running(["-m", "service"], folder) as url, TwinClient(url, timeout_s=300.0) as client:
+            client.register(life_chain())
+            begun_s = time.perf_counter()
+            post_all(url, "/v1/twins/chain/telemetry", list(frames(count)), [])
+            rows.append(
+                [f"ingest of {count:,} frames of {N_NODES + 1} channels", f"{time.perf_counter() - begun_s:.0f} s", ""]
+            )
+            rows.append(job(client, folder, "calibration", "≤ 60 s"))
+            begun_s = time.perf_counter()
+            ahead = client.forecast("chain", 3600.0, step_s=60.0)
+            rows.append(
+                [
+                    "first forecast after the activation",
+                    f"{time.perf_counter() - begun_s:.1f} s, {ahead.behind_s:.0f} s behind",
+                    "seconds",
+                ]
+            )
+            while client.twin("chain").catching_up:
+                time.sleep(0.5)
+            rows.append(["the window of the archive assimilated", f"{time.perf_counter() - begun_s:.0f} s", ""])
+            rows.append(job(client, folder, "calibration", "", thin=True, activate=False))
+            if not given.without_diagnosis:
+                rows.append(job(client, folder, "diagnosis", "≤ 300 s, ≤ 1 GB"))
+            archive = size_MB(
+                path, "SELECT sum(length(seq) + length(time) + length(value) + length(received)) FROM chunk"
+            )
+            residuals = size_MB(path, "SELECT sum(length(seq) + length(time) + length(value)) FROM residual")
+            per = size_MB(path, "SELECT 1e6 * sum(length(seq) + length(time) + length(value)) / sum(n) FROM residual")
+            each = size_MB(
+                path,
+                "SELECT 1e6 * sum(length(seq) + length(time) + length(value) + length(received)) / sum(n) FROM chunk",
+            )
+            rows.append(
+                [
+                    "archive and residuals on disk",
+                    f"{archive:.0f} MB ({each:.0f} B a frame), {residuals:.0f} MB ({per:.0f} B a frame)",
+                    "residuals ≤ archive",
+                ]
+            )
+            rows += answers(url, folder)
+            rows.append(vast(url))
+            with stalls(url) as latencies_s:
+                begun_s = time.perf_counter()
+                client.delete("chain")
+                took_s = time.perf_counter() - begun_s
+                while size_MB(path, "SELECT 1e6 * count(*) FROM chunk") > 0:
+                    time.sleep(0.2)
+                gone_s = time.perf_counter() - begun_s
+            figures = f"{1e3 * took_s:.0f} ms, gone after {gone_s:.0f} s, longest stall of others {1e3 * max(latencies_s):.0f} ms"
+            rows.append([f"deletion of the twin of {count:,} frames", figures, "nobody stalls"])
+    table = markdown_table(["what", "measured", "wanted"], rows)
+    note = f"Load of the machine before and after: {load:.1f} and {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
+    save_table("service_years", "A large archive", table, "benchmarks.service_years", note)
+    print(table)
+
+
+def life_chain() -> dict[str, Any]:
+    """Return the chain with as many nodes as this benchmark has sensors."""
+    life.N_NODES = N_NODES
+    return life.chain()
+
+
+if __name__ == "__main__":
+    main()

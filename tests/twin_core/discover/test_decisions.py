@@ -1,0 +1,225 @@
+"""The deciding rooms at their boundaries: what is likely enough, what predicts, what stands, and what goes first."""
+
+from dataclasses import dataclass, field, replace
+from threading import Barrier, Thread
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from twin_core.discover import judge
+from twin_core.discover import search as searching
+from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.judge import (
+    ALTERNATIVE_NATS,
+    FORESIGHT,
+    NO_FORESIGHT,
+    NO_LAW,
+    NO_MORE,
+    NOT_SUPPORTED,
+    REPEATABLE_SHARE,
+    Finding,
+    Judged,
+    Search,
+    accept,
+    is_close,
+    most_left,
+    once_each,
+    simplest_first,
+    threshold,
+)
+from twin_core.discover.once import once
+from twin_core.discover.search import COARSEST, DOMINANCE, withdraw
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect
+
+JUST = 1e-6
+NEEDED = 4.6
+
+
+@dataclass
+class Problem:
+    n_free: int
+
+
+@dataclass
+class Fit:
+    problem: Problem
+
+
+@dataclass
+class Stub:
+    """A trial of which only the excess and the number of its parameters count."""
+
+    effects: tuple[Effect, ...] = ()
+    left: float = 0.0
+    n_free: int = 3
+    fit: Fit = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.fit = Fit(Problem(self.n_free))
+
+    def excess(self) -> Any:
+        return np.array([2.0 * self.left, 0.0])
+
+
+def stub(*effects: Effect, left: float = 0.0, n_free: int = 3) -> Trial:
+    return cast(Trial, Stub(tuple(effects), left, n_free))
+
+
+def load(node: str) -> Effect:
+    return REGISTRY["constant_heat_load"]({"node": node}, {"Q_W": 1.0})
+
+
+def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresight: float = 0.5) -> Judged:
+    validation = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
+    return Judged((load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free), validation)
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.01, 1e-6])
+def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
+    assert np.exp(-threshold(rate)) == pytest.approx(rate)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "forward", "n_sessions", "is_law", "foresight"),
+    [
+        (0.5, 0.5, 1, True, 0.5),
+        (0.25, 1.0, 1, True, 0.5),
+        (0.25, 1.0, 1, False, 0.5),
+        (0.5, 0.7, 3, True, 0.7),
+        (0.5, 0.75, 3, True, 0.75),
+        (0.5, 0.75 + JUST, 3, True, 1.0),
+        (0.5, 0.9, 3, False, np.sqrt(0.45)),
+    ],
+    ids=[
+        "alike",
+        "geometric mean",
+        "an event",
+        "told between sessions",
+        "half of the gain",
+        "less than half",
+        "event, sessions",
+    ],
+)
+def test_foresight(ratio: float, forward: float, n_sessions: int, is_law: bool, foresight: float) -> None:
+    told = Validation(ratio, 1.0, forward, 0.1, 1.0, n_sessions, is_law)
+    assert told.foresight == pytest.approx(foresight)
+
+
+@pytest.mark.parametrize(("nats", "most"), [(0.0, NEEDED), (46.0, NEEDED), (460.0, 46.0)])
+def test_what_a_name_may_leave_is_weighed_against_what_it_explains(nats: float, most: float) -> None:
+    assert most_left(nats, NEEDED) == pytest.approx(most)
+    assert REPEATABLE_SHARE < 1.0
+
+
+@pytest.mark.parametrize(("behind", "close"), [(0.0, True), (ALTERNATIVE_NATS - JUST, True), (ALTERNATIVE_NATS, False)])
+def test_alternatives(behind: float, close: bool) -> None:
+    assert is_close(judged("a", 50.0 - behind), judged("b", 50.0)) == close
+
+
+def test_the_simplest_of_those_that_the_data_hardly_tell_comes_first() -> None:
+    options = [judged("a", 50.0, n_free=5), judged("b", 48.0, n_free=3), judged("c", 40.0, n_free=1)]
+    assert [j.effects[0].where["node"] for j in simplest_first(options)] == ["b", "a", "c"]
+
+
+def test_every_set_of_effects_counts_once_at_its_best() -> None:
+    kept = once_each([judged("a", 1.0), judged("b", 2.0), judged("a", 3.0)])
+    assert [(j.effects[0].where["node"], j.evidence.log_bayes_factor) for j in kept] == [("a", 3.0), ("b", 2.0)]
+
+
+@pytest.fixture
+def examined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the foresight of an option as it stands, and one at node ``form`` for no law."""
+
+    def told(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
+        assert option.validation is not None
+        if not option.validation.foresight < FORESIGHT:
+            return replace(option, reason=NO_FORESIGHT), False
+        is_form = option.effects[0].where["node"] == "form"
+        return replace(option, reason=NO_LAW if is_form else ""), is_form
+
+    monkeypatch.setattr(judge, "_examined", told)
+
+
+@pytest.mark.usefixtures("examined")
+@pytest.mark.parametrize(
+    ("options", "named", "reasons"),
+    [
+        ([judged("a", NEEDED + JUST)], "a", []),
+        ([judged("a", NEEDED)], None, [NOT_SUPPORTED]),
+        ([judged("a", 90.0, foresight=FORESIGHT)], None, [NO_FORESIGHT]),
+        ([judged("a", 90.0, foresight=FORESIGHT - JUST)], "a", []),
+        ([judged("a", 90.0, foresight=0.99), judged("b", 60.0)], "b", [NO_FORESIGHT]),
+        ([judged("a", 90.0), judged("b", 60.0)], "a", []),
+        ([judged("form", 90.0), judged("b", 60.0)], None, [NO_LAW]),
+        ([judged("form", 90.0), judged("b", 3.0)], None, [NO_LAW, NOT_SUPPORTED]),
+    ],
+    ids=["likely", "at the odds", "no better", "hardly better", "the next", "the likeliest", "no law", "nothing else"],
+)
+def test_what_is_accepted(options: list[Judged], named: str | None, reasons: list[str]) -> None:
+    state = Search(stub(left=9.0), stub(left=9.0))
+    assert accept(state, options, NEEDED) == (named is not None)
+    assert [f.effects[0].where["node"] for f in state.findings] == ([] if named is None else [named])
+    assert [j.reason for j in state.rejected] == reasons
+    if named is not None:
+        assert state.findings[0].explained == pytest.approx(9.0)
+
+
+@pytest.mark.parametrize(
+    ("explained", "left", "kept"),
+    [
+        ([5.0, 0.2], 0.0, ["n0", "n1"]),
+        ([5.0, 0.2], 0.2 / DOMINANCE, ["n0", "n1"]),
+        ([5.0, 0.2], 0.2 / DOMINANCE + JUST, ["n0"]),
+        ([0.2, 5.0], 0.5, ["n1"]),
+        ([1.0, 1.0], 0.5, []),
+        ([DOMINANCE * COARSEST, 900.0], 50.0, ["n0", "n1"]),
+        ([DOMINANCE * COARSEST - JUST, 900.0], 50.0, ["n1"]),
+    ],
+    ids=[
+        "fits to the noise",
+        "just enough",
+        "too little",
+        "the weakest",
+        "each beside the other",
+        "coarsest",
+        "within it",
+    ],
+)
+def test_what_explains_no_more_than_what_stays_is_withdrawn(
+    monkeypatch: pytest.MonkeyPatch, explained: list[float], left: float, kept: list[str]
+) -> None:
+    """What a withdrawn finding explained is unexplained from then on."""
+    own = {f"n{i}": value for i, value in enumerate(explained)}
+
+    def refitted(effects: tuple[Effect, ...]) -> Trial:
+        names = {e.where["node"] for e in effects}
+        return stub(*effects, left=left + sum(value for name, value in own.items() if name not in names))
+
+    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
+    state.findings = [Finding(judged(name, 50.0), (), value) for name, value in own.items()]
+    withdraw(state)
+    assert [f.effects[0].where["node"] for f in state.findings] == kept
+    assert [e.where["node"] for e in state.trial.effects] == kept
+    assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
+
+
+def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:
+    both, calls = Barrier(2, timeout=20.0), list[int]()
+
+    class Costly:
+        @once
+        def value(self) -> int:
+            both.wait()  # passes only while the other object is at it too
+            calls.append(1)
+            return 7
+
+    objects = (Costly(), Costly())
+    threads = [Thread(target=thing.value) for thing in objects]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=30.0)
+    assert [thing.value() for thing in objects] == [7, 7] and len(calls) == 2
