@@ -20,6 +20,10 @@ def append(
     connection.execute("DELETE FROM audit WHERE id <= ?", (int(row.lastrowid or 0) - KEPT,))
 
 
+def settled(connection: Connection) -> None:
+    """Do nothing: whoever waits for this write waits for every line before it."""
+
+
 def select(connection: Connection, most: int, before: int | None) -> list[dict[str, Any]]:
     """Return the newest lines, or those before one."""
     query = """SELECT id, at_us, who, method, path, status, client, detail FROM audit WHERE id < ?

@@ -33,6 +33,7 @@ async def list_audit(
     before: Annotated[int | None, Query(ge=1, le=2**62, description="Only lines before this one.")] = None,
 ) -> AuditList:
     """List who changed what and who was refused, the newest first."""
+    await service.database.write(audit_table.settled)
     rows = await service.database.read(audit_table.select, limit, before)
     return AuditList(audit=[AuditLine(**row) for row in rows])
 
