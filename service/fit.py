@@ -54,7 +54,13 @@ _PARTS: dict[str, Callable[[Json], dict[str, Any]]] = {
     "radiator": lambda spec: {
         f"{r['node']} → {r['sink']}": (r["emissivity"], r["area_m2"]) for r in spec.get("radiators") or ()
     },
-    "load": lambda spec: {f"{c['channel']} → {c['node']}": c.get("weight") for c in spec.get("loads") or ()},
+    "load": lambda spec: {
+        f"{c['channel']} → {c['node']}" + (f" × {c['factor']}" if c.get("factor") else ""): c.get("weight")
+        for c in spec.get("loads") or ()
+    },
+    "radiation": lambda spec: {" – ".join(sorted(c["between"])): None for c in spec.get("radiation") or ()},
+    "heater": lambda spec: {f"{h.get('control') or h['node']} → {h['node']}": None for h in spec.get("heaters") or ()},
+    "derived channel": lambda spec: {name: d["formula"] for name, d in (spec.get("derived") or {}).items()},
 }
 
 

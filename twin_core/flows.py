@@ -9,7 +9,7 @@ from twin_core.effects import effect_to_json
 from twin_core.effects.heat import effect_heat_W
 from twin_core.forecast.assumed import future_record
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
-from twin_core.network.model import Network
+from twin_core.network.model import Network, declared_terms
 from twin_core.network.terms import Along, Term
 from twin_core.simulate.forcing import build_forcing
 from twin_core.telemetry import Record
@@ -34,8 +34,9 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
     -------
     dict
         ``nodes`` with temperature_K and net heat_W; ``boundaries`` with the temperature_K that is declared; ``links``
-        (conductors and radiators) whose heat_W flows from ``ends[0]`` to ``ends[1]`` at these temperatures; ``loads`` and
-        ``effects`` with the heat_W that each brings into its nodes. The heats into a node add up to its net heat.
+        (conductors, radiators and radiation) whose heat_W flows from ``ends[0]`` to ``ends[1]`` at these temperatures, one
+        that is ``one_way`` without being taken from the first; ``loads``, ``heaters`` and ``effects`` with the heat_W that each
+        brings into its nodes. The heats into a node add up to its net heat.
 
     Raises
     ------
@@ -56,7 +57,8 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
             for i, name in enumerate(network.nodes)
         ],
         "boundaries": [{"id": name, "temperature_K": value} for name, value in boundaries.items()],
-        "links": [*_conductors(model, known), *_radiators(model, known)],
+        "links": [*_conductors(model, known), *_radiators(model, known), *_radiation(model, known)],
+        "heaters": _heaters(model, network, along, values),
         "loads": _loads(model, network, along, values),
         "effects": _effects(model, network, along),
     }
@@ -91,6 +93,10 @@ def _conductors(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]
         conductance = model.values[conductor.name]
         heat_W = conductance * (known_K[first] - known_K[second])
         link: Json = {"kind": "conductor", "ends": [first, second], "heat_W": heat_W}
+        if conductor.into is not None:
+            source = first if conductor.into == second else second
+            link = {**link, "ends": [source, conductor.into], "heat_W": heat_W if source == first else -heat_W}
+            link["one_way"] = True
         links.append({**link, "conductance_W_per_K": conductance})
     return links
 
@@ -103,6 +109,27 @@ def _radiators(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]:
         link = {"kind": "radiator", "ends": [radiator.node, radiator.sink], "heat_W": heat_W}
         links.append({**link, "emissive_area_m2": area_m2})
     return links
+
+
+def _radiation(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]:
+    links = []
+    for coupling in model.spec.radiation:
+        first, second = coupling.between
+        area_m2 = model.values[coupling.name]
+        heat_W = STEFAN_BOLTZMANN_W_PER_M2_K4 * area_m2 * (known_K[first] ** 4 - known_K[second] ** 4)
+        links.append({"kind": "radiation", "ends": [first, second], "heat_W": heat_W, "exchange_area_m2": area_m2})
+    return links
+
+
+def _heaters(model: CalibratedModel, network: Network, along: Along, values: FloatArray) -> list[Json]:
+    """Return the declared heaters, whose terms stand behind those of the loads; a thermostat's by what its memory says."""
+    n_terms = len(declared_terms(network.layout))
+    terms = network.terms[n_terms - len(model.spec.heaters) : n_terms]
+    found = []
+    for heater, term in zip(model.spec.heaters, terms, strict=True):
+        into = _into_nodes(network, term, along, values)
+        found.append({"node": heater.node, "heat_W": float(into[network.layout.node(heater.node)])})
+    return found
 
 
 def _loads(model: CalibratedModel, network: Network, along: Along, values: FloatArray) -> list[Json]:

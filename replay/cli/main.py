@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import click
 
+from replay.cli.balance import balance
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
@@ -44,7 +45,7 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(init, check, show, export),
+    *(init, check, balance, show, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
     *(backup, restore, migrate),
 ):

@@ -2,10 +2,14 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+NUMBER = re.compile(r"(?<![\w:-])-?\d+\.\d+(?![\w:-])")
+"""Digits that another machine's rounding may change, as little as it may; whole numbers, instants and names are words."""
 
 FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 
@@ -24,6 +28,8 @@ def test_a_notebook_is_what_its_script_prints(script: Path) -> None:
     made = builder().notebook(script.read_text())
     saved = json.loads(script.with_suffix(".ipynb").read_text())
     assert [c["source"] for c in saved["cells"]] == [c["source"] for c in made["cells"]], "run docs/notebooks/build.py"
-    assert all(
-        c["outputs"] == m["outputs"] for c, m in zip(saved["cells"], made["cells"], strict=True) if "outputs" in c
-    )
+    texts = [["".join(o["text"] for o in c.get("outputs", ())) for c in book["cells"]] for book in (saved, made)]
+    for before, now in zip(*texts, strict=True):
+        assert NUMBER.sub("#", before) == NUMBER.sub("#", now)
+        told, seen = ([float(x) for x in NUMBER.findall(text)] for text in (before, now))
+        assert told == pytest.approx(seen, rel=0.1, abs=0.02)

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from tests.twin_core.network.test_declared_terms import data, record
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects import effect_from_json
 from twin_core.flows import heat_flows
+from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -55,3 +57,23 @@ def test_every_flow_by_hand() -> None:
     assert net == {"a": pytest.approx(10.0 - 10.0 - radiated), "b": pytest.approx(10.0 - 2.5 + 7.0)}
     assert [node["sensed"] for node in found["nodes"]] == [True, False]
     assert {b["id"]: b["temperature_K"] for b in found["boundaries"]} == {"space": 3.0, "room": 290.0}
+
+
+def test_the_heats_of_every_declared_term_add_up() -> None:
+    """Radiation between nodes, one-way conductors, heaters and derived channels; a node that stores nothing is in balance."""
+    spec = load_spec(data())
+    zero = dict.fromkeys(spec.sensors, 0.1)
+    values = build_network(spec).parameters.as_dict()
+    model = CalibratedModel(spec, (), values, np.zeros((0, 0)), (), zero, zero, zero, 60.0)
+    found = heat_flows(model, record(), {"mean_K": [280.0, 260.0, 250.0, 299.0]})
+    net = {node["id"]: 0.0 for node in found["nodes"]}
+    for link in found["links"]:
+        first, second = link["ends"]
+        if first in net and not link.get("one_way"):
+            net[first] -= link["heat_W"]
+        if second in net:
+            net[second] += link["heat_W"]
+    for entry in (*found["loads"], *found["heaters"]):
+        net[entry["node"]] += entry["heat_W"]
+    assert net == pytest.approx({node["id"]: node["heat_W"] for node in found["nodes"]}, abs=1e-9)
+    assert [heater["heat_W"] for heater in found["heaters"]] == pytest.approx([0.5 * 12.0, 0.7])

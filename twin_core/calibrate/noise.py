@@ -1,6 +1,7 @@
 """What the noise of a sensor is, told from its own samples."""
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from twin_core._typing import FloatArray
 from twin_core.network.spec import TwinSpec
@@ -11,28 +12,56 @@ FALLBACK_STD_K = 0.1
 """Noise assumed where a sensor has too few samples to tell."""
 
 
-def difference_noise_K(column: FloatArray) -> float:
-    """Return the white-noise standard deviation from second differences, robust against steps; NaN if too short."""
-    second = np.diff(column, 2)
-    second = second[np.isfinite(second)]
-    if second.size < 8:
+UNEVEN = 0.05
+"""Intervals that differ from their median by more than this share of it, for more than one in twenty, are uneven."""
+UNEVEN_ORDER = 4
+"""Order of the divided differences there: their points lie further apart, where a curve of second order is no longer one."""
+
+
+def difference_noise_K(time_s: FloatArray, column: FloatArray) -> float:
+    """Return the white-noise standard deviation of readings (n_times,), robust against steps; NaN if too short.
+
+    From second differences; where the sampling is uneven from divided differences, since a steady slope leaves nothing of
+    these, whatever the intervals. A difference that touches a missing reading is left out.
+    """
+    steps_s = np.diff(time_s)
+    if not steps_s.size or np.mean(np.abs(steps_s / np.median(steps_s) - 1.0) > UNEVEN) <= UNEVEN:
+        differences = np.diff(column, 2) / np.sqrt(6.0)
+    else:
+        differences = _divided_differences(time_s, column)
+    seen = differences[np.isfinite(differences)]
+    if seen.size < 8:
         return float("nan")
-    spread = float(np.median(np.abs(second - np.median(second)))) / 0.6745
-    return spread / np.sqrt(6.0)
+    return float(np.median(np.abs(seen - np.median(seen)))) / 0.6745
+
+
+def _divided_differences(time_s: FloatArray, column: FloatArray) -> FloatArray:
+    """Return divided differences of white noise of unit variance, scaled to unit variance, (n_times - ``UNEVEN_ORDER``,).
+
+    Their weights are the inverse products of the distances of a point to the others (Lagrange).
+    """
+    order = UNEVEN_ORDER
+    if column.size <= order:
+        return np.empty(0)
+    times = sliding_window_view(time_s / np.median(np.diff(time_s)), order + 1)
+    apart = times[:, :, None] - times[:, None, :] + np.eye(order + 1)
+    weights = 1.0 / np.prod(apart, axis=2)
+    scaled = (weights * sliding_window_view(column, order + 1)).sum(axis=1)
+    return np.asarray(scaled / np.linalg.norm(weights, axis=1))
 
 
 def sensor_noise_K(spec: TwinSpec, records: list[Record]) -> FloatArray:
     """Return the noise standard deviation of each sensor, (n_sensors,), in K.
 
-    The declared one where there is one, with the variance of quantisation (step^2 / 12) added; else estimated from second
+    The declared one where there is one, with the variance of quantisation (step^2 / 12) added; else estimated from
     differences, never below what quantisation leaves: a quantised sensor that does not move is not noise-free.
     """
     stds = []
     for sensor in spec.sensors:
-        columns = [r.values[sensor] for r in records if sensor in r.values]
-        step_K = max((quantum(c) for c in columns), default=0.0)
+        columns = [(r.time_s, r.values[sensor]) for r in records if sensor in r.values]
+        step_K = max((quantum(c) for _, c in columns), default=0.0)
         declared = spec.noise_std_K(sensor)
-        estimates = [e for e in (difference_noise_K(c) for c in columns) if np.isfinite(e)]
+        estimates = [e for e in (difference_noise_K(t, c) for t, c in columns) if np.isfinite(e)]
         estimate = float(np.median(estimates)) if estimates else FALLBACK_STD_K
         counting = step_K / np.sqrt(12.0)
         # What the readings show contains their quantisation wherever they move; a datasheet's figure does not.

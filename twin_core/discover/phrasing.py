@@ -150,6 +150,8 @@ def parameters(finding: Mapping[str, Any]) -> list[Json]:
         if isinstance(mean, list):
             stds = std if isinstance(std, list) else [None] * len(mean)
             text = "; ".join(with_spread(m, s) for m, s in zip(mean, stds, strict=False))
+        elif value.get("unbounded_above"):
+            text = f"{number(mean)} or more, unbounded above"
         else:
             text = with_spread(mean, std)
         rows.append({"symbol": symbol, "text": text, "unit": unit})

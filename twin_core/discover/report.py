@@ -35,6 +35,8 @@ def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
             row["std"].append(std)
         else:
             rows[base] = {"mean": mean, "std": std}
+            if std is not None and quality.told_from_below(float(effect.values[quality.name]), std):
+                rows[base]["unbounded_above"] = True
     for name in effect.reported_settings:
         if name not in effect.settings:
             continue

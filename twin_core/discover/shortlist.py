@@ -69,7 +69,9 @@ def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
     """Return effects at the best of their finer settings, where the first ones are too coarse for a local search."""
     survey = survey_of(fit)
     finer = [setting for effect in effects for setting in effect.refined(survey)]
-    best = {probe.effect.place: probe.effect for probe in reversed(screen(fit, survey, finer).probes)}
+    n_samples = int(sum(nominal.segment.valid.sum() for nominal in fit.nominals))
+    ranked = best_of_each_place(screen(fit, survey, finer).probes, n_samples)
+    best = {probe.effect.place: probe.effect for probe in ranked}
     return list({_start(e): e for e in (best.get(effect.place, effect) for effect in effects)}.values())
 
 

@@ -125,7 +125,7 @@ class NodeHeat:
     def words(self) -> str:
         """Return one sentence."""
         seen = (
-            f"Independent latent force at {self.node}: the declared model lacks {self.mean_W.mean():.3g} W on average, "
+            f"Latent force at {self.node}: the declared model lacks {self.mean_W.mean():.3g} W on average, "
             f"swinging by {self.mean_W.std():.2g} W (band {self.band_W:.2g} W), {self._following()}"
         )
         if self.effect_W is None:
@@ -134,9 +134,9 @@ class NodeHeat:
         if self.correlation is not None:
             said += f", correlation {self.correlation:.2f}"
         verdict = {
-            True: "both agree",
-            False: "they disagree, the declared parameters may have taken up a part",
-            None: "the band is too wide to tell",
+            True: "the two agree",
+            False: "the two differ, as they do where declared parameters had taken up a part of that heat",
+            None: "the band is too wide to compare them",
         }[self.agrees]
         return f"{seen}; {said}: {verdict}."
 

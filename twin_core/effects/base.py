@@ -87,6 +87,10 @@ class Quality:
             return self.resolution
         return float(np.hypot(fitted, self.resolution))
 
+    def told_from_below(self, mean: float, std: float) -> bool:
+        """Return whether the data leave open how large it is: its deviation is no less than that of its prior, relative to it."""
+        return self.open_ended and self.prior_std is not None and std >= 0.99 * self.prior_std * abs(mean)
+
     def moved(self, amount: float) -> float | None:
         """Return the value at a distance from null, None if it is not positive but must be.
 

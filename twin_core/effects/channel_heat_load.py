@@ -6,14 +6,18 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Beyond, Effect, Quality, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
-from twin_core.network.terms import SteeredTable, TableLoad, nearest
+from twin_core.network.terms import Along, SteeredTable, TableLoad, nearest
 from twin_core.orbit.environment import BETA
 
 N_KNOTS = 6
+OTHER_KNOTS = (4, 9, 13, 18)
+"""Other numbers of knots that a curve is tried with where it is worth a refit; each value must pay for itself."""
+EDGE = 1e-9
+"""Share of the visited range by which a channel may leave it without a word."""
 MIN_SHARE = 0.02
 """An inner knot needs this share of the samples near it, or its value would be a guess."""
 
@@ -21,10 +25,10 @@ N_PARTS, MIN_PARTS = 8, 2
 """What a state does at a knot must be seen in so many parts of the record: only what repeats can be told from chance."""
 
 
-def even_knots(series: FloatArray) -> tuple[float, ...]:
+def even_knots(series: FloatArray, n_knots: int = N_KNOTS) -> tuple[float, ...]:
     """Return knots spread evenly over the visited range, ends included, without those that few samples are near."""
-    knots = np.linspace(float(series.min()), float(series.max()), N_KNOTS)
-    kept = np.bincount(nearest(series, knots.tolist()), minlength=N_KNOTS) > MIN_SHARE * series.size
+    knots = np.linspace(float(series.min()), float(series.max()), n_knots)
+    kept = np.bincount(nearest(series, knots.tolist()), minlength=n_knots) > MIN_SHARE * series.size
     kept[[0, -1]] = True
     return tuple(float(k) for k in knots[kept])
 
@@ -52,8 +56,51 @@ class ChannelHeatLoad(Effect):
     reported_settings = ("knots", "states", "across")
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return the heat at each knot."""
-        return tuple(Quality(f"values_W[{i}]", "W", null=0.0) for i in range(len(self.settings["knots"])))
+        """Return the heat at each knot; what straight lines between knots get wrong adds to its deviation."""
+        errors = self._interpolation_error_W()
+        return tuple(Quality(f"values_W[{i}]", "W", null=0.0, resolution=float(e)) for i, e in enumerate(errors))
+
+    @property
+    def _is_curve(self) -> bool:
+        """Whether the heat is a curve over its own channel, rather than levels or another channel's table by state."""
+        return "across" not in self.settings and not self.settings["levels"]
+
+    def _interpolation_error_W(self) -> FloatArray:
+        """Return by how much a smooth curve lies off the best straight lines between its knots, (n_knots,).
+
+        Straight lines that fit a curve of second derivative f'' best lie off it by h² f'' / 12 at the knots (C. de Boor, A
+        Practical Guide to Splines, 2001, chapter III); h² f'' is told by the second differences of the values.
+        """
+        knots = np.array(self.settings["knots"], dtype=np.float64)
+        if not self._is_curve or knots.size < 3:
+            return np.zeros(knots.size)
+        values = np.array([self.values.get(f"values_W[{i}]", 0.0) for i in range(knots.size)])
+        slopes, gaps = np.diff(values) / np.diff(knots), np.diff(knots)
+        bends = np.abs(np.diff(slopes)) / (0.5 * (gaps[1:] + gaps[:-1])) * np.maximum(gaps[1:], gaps[:-1]) ** 2
+        return np.asarray(np.concatenate([bends[:1], bends, bends[-1:]]) / 12.0)
+
+    def beyond(self, layout: Layout, along: Along) -> Beyond | None:
+        """Return where the channel leaves the range of the knots: the heat is held there, a curve would have gone on."""
+        if not self._is_curve:
+            return None
+        knots = np.array(self.settings["knots"], dtype=np.float64)
+        x = along.inputs[self.where["channel"]]
+        away = np.maximum(np.maximum(knots[0] - x, x - knots[-1]), 0.0)
+        outside = away > EDGE * (knots[-1] - knots[0])
+        if not outside.any():
+            return None
+        values = np.array([self.values[q.name] for q in self.qualities()])
+        slope = float(np.sqrt(np.mean((np.diff(values) / np.diff(knots)) ** 2)))
+        visited = f"{self.where['channel']} {knots[0]:.4g} to {knots[-1]:.4g}"
+        return Beyond(layout.node(self.where["node"]), outside, np.where(outside, slope * away, 0.0), visited)
+
+    def refined(self, survey: Survey) -> Iterable[Self]:
+        """Yield the curve over fewer and over more knots."""
+        if self._is_curve:
+            series = survey.along.inputs[self.where["channel"]]
+            knots = {even_knots(series, n) for n in (N_KNOTS, *OTHER_KNOTS)}
+            for some in sorted(knots, key=len):
+                yield self._null(self.where, {"knots": some, "levels": False})
 
     def addition(self, layout: Layout) -> Addition:
         """Return the table."""

@@ -410,7 +410,8 @@ class TwinSpec(Strict):
     def _check_unseen(self) -> Iterable[str]:
         """Refuse hidden nodes that are joined with one another and with no node that is read: no data tell anything of them.
 
-        A single one may yet be joined by what the closed loop finds; it is told among the doubts.
+        A single one may yet be joined by what the closed loop finds; it is told among the doubts. Nodes whose capacities are
+        known, those of an imported deck, say, need no data.
         """
         groups = {node.id: {node.id} for node in self.nodes}
         for first, second in [*(c.between for c in self.conductors), *(r.between for r in self.radiation)]:
@@ -419,8 +420,9 @@ class TwinSpec(Strict):
                 one |= other
                 groups |= dict.fromkeys(other, one)
         read = {node.id for node in self.nodes if node.sensors}
+        known = {n.id for n in self.nodes if n.capacity_J_per_K is not None and n.capacity_J_per_K.value is not None}
         for group in {id(group): group for group in groups.values()}.values():
-            if len(group) > 1 and not group & read:
+            if len(group) > 1 and not group & read and not group <= known:
                 names = ", ".join(sorted(group)[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
                 yield f"nodes: no sensor sees {names}: join one of them to a node with a sensor, or remove them"
 

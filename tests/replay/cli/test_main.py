@@ -18,6 +18,7 @@ def test_the_commands() -> None:
     assert COMMANDS == [
         *(
             "backup",
+            "balance",
             "calibrate",
             "check",
             "check-effect",

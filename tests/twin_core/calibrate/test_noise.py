@@ -20,18 +20,33 @@ def noise(std_K: float, seed: int = 0, n: int = RNG_SIZE) -> np.ndarray:
 def test_second_differences_see_the_noise_through_a_slow_signal(std_K: float) -> None:
     slow = 290.0 + 10.0 * np.sin(np.arange(RNG_SIZE) / 300.0)
     # A median of 4000 absolute values is within 4 % of its expectation in all but one case in a hundred.
-    assert difference_noise_K(slow + noise(std_K)) == pytest.approx(std_K, rel=0.05)
+    assert difference_noise_K(np.arange(RNG_SIZE), slow + noise(std_K)) == pytest.approx(std_K, rel=0.05)
 
 
 def test_steps_and_gaps_do_not_count_as_noise() -> None:
     stepped = 290.0 + 5.0 * (np.arange(RNG_SIZE) // 100 % 2) + noise(0.1)
     stepped[np.random.default_rng(1).random(RNG_SIZE) < 0.2] = np.nan
-    assert difference_noise_K(stepped) == pytest.approx(0.1, rel=0.1)
+    assert difference_noise_K(60.0 * np.arange(RNG_SIZE), stepped) == pytest.approx(0.1, rel=0.1)
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize("law", ["jitter", "bursts", "exponential"])
+def test_uneven_sampling_of_a_steep_signal_does_not_count_as_noise(law: str) -> None:
+    """An orbit of 40 K from peak to peak, read every minute on average: a slope of 20 times the noise from one to the next."""
+    rng = np.random.default_rng(2)
+    steps_s = {
+        "jitter": rng.uniform(18.0, 102.0, RNG_SIZE),
+        "bursts": np.where(np.arange(RNG_SIZE) % 5, 30.0, 180.0),
+        "exponential": 1.0 + rng.exponential(59.0, RNG_SIZE),
+    }[law]
+    time_s = np.cumsum(steps_s)
+    steep = 280.0 + 20.0 * np.sin(2.0 * np.pi * time_s / 5700.0)
+    assert difference_noise_K(time_s, steep + noise(0.036)) == pytest.approx(0.036, rel=0.08)
 
 
 @pytest.mark.parametrize("column", [np.zeros(5), np.full(100, np.nan), np.array([])])
 def test_too_few_samples_tell_nothing(column: np.ndarray) -> None:
-    assert np.isnan(difference_noise_K(column))
+    assert np.isnan(difference_noise_K(np.arange(column.size) ** 1.5, column))
 
 
 def test_a_quantised_series_shows_its_step() -> None:

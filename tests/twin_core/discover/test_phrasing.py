@@ -103,6 +103,7 @@ def test_parameters_carry_their_units() -> None:
             "C_J_per_K": {"mean": 100.0, "std": 1.0},
             "values_W": {"mean": [1.0, 2.0], "std": [0.1, None]},
             "g": {"mean": 0.5, "std": None},
+            "Q_W": {"mean": 40.0, "std": 120.0, "unbounded_above": True},
             "time": {"mean": "2026-01-03T04:05:06Z", "std": 35.2},
         }
     }
@@ -110,6 +111,7 @@ def test_parameters_carry_their_units() -> None:
         {"symbol": "C", "text": "100.0 ± 1.0", "unit": "J/K"},
         {"symbol": "values", "text": "1.00 ± 0.10; 2.000", "unit": "W"},
         {"symbol": "g", "text": "0.5000", "unit": ""},
+        {"symbol": "Q", "text": "40.0 or more, unbounded above", "unit": "W"},
         {"symbol": "time", "text": "2026-01-03T04:05:06Z ± 35", "unit": "s"},
     ]
 

@@ -74,7 +74,7 @@ def test_without_findings_there_is_nothing_to_agree_with(search):
     row = next(r for r in added["witness"] if r["node"] == "b")
     assert row["agrees"] is None and row["correlation_with_effect"] is None
     assert row["mean_W"] == pytest.approx(4.0, abs=1.5)
-    assert added["words"][0] == "before" and "latent force at b: the declared model lacks" in " ".join(added["words"])
+    assert added["words"][0] == "before" and "Latent force at b: the declared model lacks" in " ".join(added["words"])
     assert added["notices"] == ["old"] and report["words"] == ["before"]
 
 
@@ -117,10 +117,10 @@ WAVE = np.sin(np.arange(50.0) / 5.0)
 @pytest.mark.parametrize(
     ("effect_W", "mean_W", "std_W", "agrees", "words"),
     [
-        (5.0 + WAVE, 5.2 + WAVE, 0.5, True, "both agree"),
-        (5.0, 5.2 + WAVE, 0.5, True, "both agree"),
-        (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "both agree"),
-        (5.0 + WAVE, -4.0 - WAVE, 0.5, False, "disagree"),
+        (5.0 + WAVE, 5.2 + WAVE, 0.5, True, "the two agree"),
+        (5.0, 5.2 + WAVE, 0.5, True, "the two agree"),
+        (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "the two agree"),
+        (5.0 + WAVE, -4.0 - WAVE, 0.5, False, "the two differ"),
         (0.3 * WAVE, -4.0 + 0.3 * WAVE, 2.0, None, "too wide"),
         (None, 4.0, 0.5, None, "on average"),
     ],
