@@ -103,7 +103,7 @@ class Browser:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def until(self, expression: str, timeout_s: float = 30.0) -> None:
+    def until(self, expression: str, timeout_s: float = 60.0) -> None:
         """Return once an expression is true."""
         deadline_s = time.monotonic() + timeout_s
         while not self.evaluate(f"Boolean({expression})"):
