@@ -375,12 +375,12 @@ class Validation:
 
         A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
         them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
-        their geometric mean counts.
+        their geometric mean counts, and once more what makes one of them worse.
         """
         if self.n_sessions > 1 and self.is_law:
             is_told_by_all = 1.0 - self.forward_ratio >= BETWEEN_SESSIONS * (1.0 - self.ratio)
             return self.forward_ratio if is_told_by_all else 1.0
-        return float(np.sqrt(self.ratio * self.forward_ratio))
+        return float(np.sqrt(self.ratio * self.forward_ratio)) * max(1.0, self.ratio, self.forward_ratio)
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:

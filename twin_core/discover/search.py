@@ -219,12 +219,13 @@ def withdraw(state: Search) -> None:
     """Withdraw findings that explain no more than what stays unexplained: both may be what a lumped network cannot follow.
 
     Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
-    counts as unexplained.
+    counts as unexplained. A heat without a name claims nothing but to predict: beside it, all that stays counts.
     """
     while state.findings:
-        left = DOMINANCE * min(mean_excess(state.trial), COARSEST)
+        left = mean_excess(state.trial)
         weakest = min(state.findings, key=lambda finding: finding.explained)
-        if weakest.explained >= left:
+        is_named = not all(effect.fallback for effect in weakest.effects)
+        if weakest.explained >= DOMINANCE * (min(left, COARSEST) if is_named else left):
             return
         state.findings = [finding for finding in state.findings if finding is not weakest]
         state.rejected.append(replace(weakest.judged, reason=NO_MORE))

@@ -71,6 +71,11 @@ def load(node: str) -> Effect:
     return REGISTRY["constant_heat_load"]({"node": node}, {"Q_W": 1.0})
 
 
+def unnamed() -> Effect:
+    """Return an effect that claims no law; of its kind alone counts."""
+    return cast(Effect, type("Free", (), {"fallback": True, "place": "n0", "label": "free(n0)"})())
+
+
 def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresight: float = 0.5) -> Judged:
     validation = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
     return Judged((load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free), validation)
@@ -87,6 +92,8 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
         (0.5, 0.5, 1, True, 0.5),
         (0.25, 1.0, 1, True, 0.5),
         (0.25, 1.0, 1, False, 0.5),
+        (0.25, 2.0, 1, True, 2.0 * np.sqrt(0.5)),
+        (1.44, 0.25, 1, False, 1.44 * 0.6),
         (0.5, 0.7, 3, True, 0.7),
         (0.5, 0.75, 3, True, 0.75),
         (0.5, 0.75 + JUST, 3, True, 1.0),
@@ -96,6 +103,8 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
         "alike",
         "geometric mean",
         "an event",
+        "worse at the end",
+        "worse on blocks",
         "told between sessions",
         "half of the gain",
         "less than half",
@@ -204,6 +213,16 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     assert [f.effects[0].where["node"] for f in state.findings] == kept
     assert [e.where["node"] for e in state.trial.effects] == kept
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
+
+
+@pytest.mark.parametrize(("explained", "stands"), [(DOMINANCE * 50.0, True), (DOMINANCE * 50.0 - JUST, False)])
+def test_beside_a_heat_without_a_name_all_that_stays_counts(explained: float, stands: bool) -> None:
+    free = unnamed()
+    option = Judged((free,), Evidence(50.0, 0.0), stub(free))
+    state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
+    state.findings = [Finding(option, (), explained)]
+    withdraw(state)
+    assert bool(state.findings) == stands
 
 
 def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:
