@@ -10,9 +10,9 @@ from numba import njit
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 
-SETTLED = 1e-5
+SETTLED = 1e-6
 """A covariance that moves by less from sample to sample, in units of its deviations, has reached its limit: the likelihood of
-a thousand samples of seven sensors changes by a thousandth of a nat."""
+a thousand samples of seven sensors changes by less than a thousandth of a nat."""
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")

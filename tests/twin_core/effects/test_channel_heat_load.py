@@ -66,7 +66,7 @@ def found(curve: str) -> tuple[ChannelHeatLoad, dict]:
     start = next(iter(ChannelHeatLoad.starts(PLACE, survey_of(fit))))
     (chosen,) = refined(fit, [start])
     trial = try_effects(base, [chosen], n_passes=15)
-    model = to_model(trial.calibration, trial.present_effects)
+    model = to_model(trial.calibration(), trial.present_effects)
     (effect,) = model.effects
     assert isinstance(effect, ChannelHeatLoad)
     return effect, parameters_json(effect, {p["name"]: p["std"] for p in model.summary["parameters"]})
