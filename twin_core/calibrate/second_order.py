@@ -48,10 +48,6 @@ Loss = Literal["squared", "huber"]
 READINGS_PER_UNKNOWN = 2
 """Fewer are refused: any model passes through as many readings as it has unknowns."""
 
-COMPARABLE = 1e-5
-"""A model that is compared with others has converged when a step lowers its cost by less than this share: a tenth of a nat on ten
-thousand readings."""
-
 MAX_HALVINGS = 3
 
 
@@ -265,19 +261,10 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
     """Return the open-loop calibration that starts from a fit in the presence of latent heat.
 
-    ``near`` are optima of the same problem found otherwise: the best of all is kept. It is good enough to be compared.
+    ``near`` are optima of the same problem found otherwise: the best of all is kept.
     """
-    best = min([minimise(fit.problem, fit.unknowns(), tolerance=COMPARABLE), *near], key=lambda o: o.fit.cost)
+    best = min([minimise(fit.problem, fit.unknowns()), *near], key=lambda o: o.fit.cost)
     return Calibration(fit.problem, best, fit_whitener(fit.problem, fit.problem.residuals(best.fit)), max_step_s)
-
-
-def polished(calibration: Calibration) -> Calibration:
-    """Return a calibration that was good enough to be compared, at its optimum."""
-    problem, optimum = calibration.problem, calibration.optimum
-    best = minimise(problem, optimum.unknowns, near=optimum.fit)
-    if not best.fit.cost <= optimum.fit.cost:
-        return calibration
-    return replace(calibration, optimum=best, whitener=fit_whitener(problem, problem.residuals(best.fit)))
 
 
 def _step_error(problem: Problem, finer: Problem) -> float:

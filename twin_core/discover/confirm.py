@@ -14,7 +14,7 @@ from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import COMPARABLE, Calibration, from_heat_fit, sampling_step_s
+from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
 from twin_core.discover.once import once
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
@@ -75,7 +75,7 @@ class Trial:
         if self.simpler is not None:
             values = self.fit.network.parameters.as_dict()
             start = carried_over(self.simpler.calibration(), self.fit.problem, values)
-            near.append(minimise(self.fit.problem, start, tolerance=COMPARABLE))
+            near.append(minimise(self.fit.problem, start))
         return from_heat_fit(self.fit, self.max_step_s, near=near)
 
     @property
@@ -270,7 +270,7 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
     """
     problem = extended(base.fit.problem, effects)
     own = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(base.calibration(), problem, own), tolerance=COMPARABLE)
+    optimum = minimise(problem, carried_over(base.calibration(), problem, own))
     if optimum.status == "no_solution":
         return None
     fit = about_trajectory(problem, optimum)

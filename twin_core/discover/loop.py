@@ -13,8 +13,8 @@ from twin_core.calibrate.containment import NO_DEADLINE, attempted
 from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network, polished, to_model
-from twin_core.discover.confirm import Trial, fitted_effects
+from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.discover.confirm import Trial
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
 from twin_core.discover.mistakes import told_mistakes
@@ -163,9 +163,7 @@ def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
 
 def corrected(found: Search) -> CalibratedModel:
     """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
-    calibration = polished(found.trial.calibration())
-    effects = fitted_effects(found.trial.effects, calibration.network.parameters.as_dict())
-    return centred(to_model(calibration, effects), found.trial.fit)
+    return centred(to_model(found.trial.calibration(), found.trial.present_effects), found.trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:
