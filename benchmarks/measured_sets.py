@@ -44,22 +44,28 @@ def present(splits: Sequence[Split], data: Path) -> list[Split]:
     return there
 
 
-def page(results: Sequence[Result], splits: Sequence[Split], data: Path, deadline_s: float) -> str:
-    """Return every table and the summary as markdown, in the order of the splits."""
+def page(results: Sequence[Result], splits: Sequence[Split], data: Path, note: str = "") -> str:
+    """Return every table, a note and the summary as markdown, in the order of the splits."""
     by_name = {result.name: result for result in results}
     ordered = [by_name[split.name] for split in splits]
     others = {split.name: split.reference(data / split.folder) for split in splits}
     single = {split.name for split in splits if split.every_pair}
     sets, runs = ([r for r in ordered if (r.name in single) == alone] for alone in (False, True))
     parts = [
-        *((main_table(sets, others), LEGEND, f"Each search had a deadline of {deadline_s:g} s.") if sets else ()),
+        *((main_table(sets, others), LEGEND, _deadlines(ordered), note) if sets else ()),
         "## Figures to reach",
         figures_table(ordered),
         *((RUNS_TITLE, RUNS_WORDS, main_table(runs, others), PAIRS_WORDS, pairs_table(runs)) if runs else ()),
         "## Summary",
         summary(ordered),
     ]
-    return "\n\n".join(part.strip() for part in parts) + "\n"
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def _deadlines(results: Sequence[Result]) -> str:
+    seconds = sorted({result.deadline_s for result in results})
+    told = " or ".join(f"{s:g}" for s in seconds)
+    return f"Each search had a deadline of {told} s{', as its note tells where it ended there' if len(seconds) > 1 else ''}."
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -73,6 +79,7 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="FILE", help="finished runs, as JSON lines")
     parser.add_argument("--fresh", action="store_true", help="run again what the cache holds")
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="runs at a time, one thread each")
+    parser.add_argument("--note", default="", help="what a reader should know, such as what else the machine did")
     given = parser.parse_args(words)
     splits = present(chosen(given.only), given.data)
     if not splits:
@@ -88,7 +95,7 @@ def main(words: Sequence[str] | None = None) -> None:
     ):
         results.append(result)
         print(in_one_line(result), flush=True)
-    text = page(results, splits, given.data, given.deadline)
+    text = page(results, splits, given.data, given.note)
     if not given.only:
         save_table("measured_sets", TITLE, text, "benchmarks.measured_sets")
     print(text)
