@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from replay.cli.balance import balance
+from replay.cli.bridge import bridge
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
@@ -47,7 +48,7 @@ def twin(traceback: bool) -> None:
 for command in (
     *(init, check, balance, show, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
-    *(backup, restore, migrate),
+    *(bridge, backup, restore, migrate),
 ):
     twin.add_command(command)
 
