@@ -20,6 +20,7 @@ from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, restore
 from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
+from replay.cli.printing import print_page
 from replay.cli.record import record
 from replay.cli.register import register
 from replay.cli.serve import serve
@@ -45,7 +46,7 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(init, check, balance, show, export),
+    *(init, check, balance, show, print_page, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
     *(backup, restore, migrate),
 ):

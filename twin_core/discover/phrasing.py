@@ -123,6 +123,11 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
 
 
+def unit(plain: str) -> str:
+    """Return a unit as it is printed: ``m²`` for ``m2``."""
+    return plain.replace("m2", "m²").replace("^2", "²")
+
+
 def with_spread(mean: Any, std: Any) -> str:
     """Return ``mean ± std``, both cut where the spread makes further digits meaningless; a date stays as it is."""
     if isinstance(mean, str):
