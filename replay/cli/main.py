@@ -13,6 +13,7 @@ from replay.cli.balance import balance
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
+from replay.cli.correlate import correlate
 from replay.cli.demo import demo
 from replay.cli.export import export
 from replay.cli.forecast import forecast
@@ -47,7 +48,20 @@ def twin(traceback: bool) -> None:
 
 for command in (
     *(init, check, balance, show, print_page, export),
-    *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
+    *(
+        demo,
+        serve,
+        register,
+        simulate,
+        replay,
+        record,
+        import_model,
+        calibrate,
+        correlate,
+        forecast,
+        close_loop,
+        check_effect,
+    ),
     *(backup, restore, migrate),
 ):
     twin.add_command(command)

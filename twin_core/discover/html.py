@@ -125,7 +125,9 @@ def _parameters(report: Mapping[str, Any]) -> list[Json]:
         else:
             said, kind = ("identified", "met") if row.get("identified") else ("not identified", "missed")
         texts = {
-            k: phrasing.with_spread(v.get("mean"), v.get("std")) for k in ("calibrated", "corrected") if (v := row[k])
+            k: phrasing.with_spread(v.get("mean"), v.get("std"))
+            for k in ("calibrated", "corrected")
+            if (v := row.get(k))
         }
         declared = phrasing.number(row.get("declared"), 4)
         rows.append(

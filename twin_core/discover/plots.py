@@ -68,6 +68,7 @@ def build_plots(
         "criteria": {
             "bias_K": before.spec.criteria.bias_K,
             "q99_abs_K": before.spec.criteria.q99_abs_K,
+            "std_K": before.spec.criteria.std_K,
             "before": report["criteria"]["before"],
             "after": report["criteria"]["after"],
         },
