@@ -5,9 +5,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 GROUND := $(VENV)/.ground
+DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-ground check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
+.PHONY: demo test test-fast test-ground check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -22,6 +23,11 @@ $(BENCH): $(STAMP)
 
 $(GROUND): $(STAMP)
 	$(BIN)/pip install --quiet --editable ".[dev,neural,ground]"
+	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/openmct openmct@4
+	touch $@
+
+$(DOCS): $(STAMP)
+	$(BIN)/pip install --quiet --editable ".[docs]"
 	touch $@
 
 demo: $(STAMP)
@@ -40,6 +46,9 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+docs: $(DOCS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+import thermal_twin
 from replay.cli.main import main, twin
 from service.app import ROUTERS
 from service.settings import Settings
@@ -133,6 +134,18 @@ def test_every_link_leads_somewhere() -> None:
         for target in re.findall(r"\]\(([^)#]+)", path.read_text()):
             if "://" not in target:
                 assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_the_reference_lists_every_function_of_the_facade() -> None:
+    page = (ROOT / "docs" / "api" / "thermal_twin.md").read_text()
+    for name in thermal_twin.__all__:
+        assert name == "__version__" or re.search(rf"\b{name}\b", page) or name == "TwinError", name
+
+
+def test_every_page_stands_in_the_site() -> None:
+    """What mkdocs.yml lists is there, and every page is listed."""
+    listed = set(re.findall(r"^ +- ([a-z0-9_/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert listed == {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
 
 
 def test_every_decision_follows_the_form() -> None:

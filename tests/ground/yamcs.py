@@ -6,6 +6,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Self
@@ -14,7 +15,7 @@ import httpx
 import yaml
 
 BUNDLE = importlib.util.find_spec("fprime_yamcs_bundle")
-JAVA = shutil.which("java")
+JAVA = shutil.which("java") or shutil.which("java", path=str(Path(sys.executable).parent))
 MISSING = (
     "no Yamcs server here: pip install fprime-yamcs-bundle"
     if BUNDLE is None
