@@ -76,7 +76,9 @@ class Trial:
             values = self.fit.network.parameters.as_dict()
             start = carried_over(self.simpler.calibration(), self.fit.problem, values)
             near.append(minimise(self.fit.problem, start))
-        return from_heat_fit(self.fit, self.max_step_s, near=near)
+        return from_heat_fit(
+            self.fit, self.max_step_s, near=near, afresh=not any(o.status == "converged" for o in near)
+        )
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:

@@ -12,6 +12,7 @@ from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError
+from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
 
@@ -27,6 +28,7 @@ UNEXPLAINED_SHARE = 1.0
 
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 NOT_EXAMINED = "its predictions could not be examined"
@@ -99,6 +101,8 @@ class Search:
         Candidates whose arithmetic failed, with the reason.
     left_out
         What was not looked at for want of time.
+    every
+        Of how many samples of the training record the search looked at one.
     """
 
     trial: Trial
@@ -109,6 +113,7 @@ class Search:
     rejected: list[Judged] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    every: int = 1
 
     def fork(self) -> "Search":
         """Return a search that starts from here and shares what failed or was left out."""
@@ -125,7 +130,7 @@ class Search:
         A candidate whose values run away is as unlikely as can be: NumPy's warnings on the way are nobody's business.
         """
         try:
-            with limited(self.deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            with limited(self.deadline), hurried(), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 check_time()
                 return attempted(work, what, self.failures)
         except TimeIsUpError:
@@ -176,7 +181,12 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
 
 
 def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
-    """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law."""
+    """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
+
+    A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
+    """
+    if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
+        return replace(judged, reason=LESS_LIKELY), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < FORESIGHT:
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False

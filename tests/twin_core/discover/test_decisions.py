@@ -29,12 +29,13 @@ from twin_core.discover.judge import (
     threshold,
 )
 from twin_core.discover.once import once
-from twin_core.discover.search import COARSEST, DOMINANCE, withdraw
+from twin_core.discover.search import COARSENESS, DOMINANCE, VISIBLE, least_explained, withdraw
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
 JUST = 1e-6
 NEEDED = 4.6
+LEAST, MOST = COARSENESS
 
 
 @dataclass
@@ -179,17 +180,19 @@ def test_what_is_accepted(options: list[Judged], named: str | None, reasons: lis
     ("explained", "left", "kept"),
     [
         ([5.0, 0.2], 0.0, ["n0", "n1"]),
-        ([5.0, 0.2], 0.2 / DOMINANCE, ["n0", "n1"]),
-        ([5.0, 0.2], 0.2 / DOMINANCE + JUST, ["n0"]),
-        ([0.2, 5.0], 0.5, ["n1"]),
-        ([1.0, 1.0], 0.5, []),
-        ([DOMINANCE * COARSEST, 900.0], 50.0, ["n0", "n1"]),
-        ([DOMINANCE * COARSEST - JUST, 900.0], 50.0, ["n1"]),
+        ([9.0, DOMINANCE * LEAST], VISIBLE, ["n0", "n1"]),
+        ([9.0, DOMINANCE * LEAST - JUST], VISIBLE, ["n0"]),
+        ([9.0, DOMINANCE * LEAST / 2], VISIBLE / 2, ["n0", "n1"]),
+        ([0.2, 9.0], 0.5, ["n1"]),
+        ([2.0, 2.5], 0.5, []),
+        ([DOMINANCE * MOST, 900.0], 50.0, ["n0", "n1"]),
+        ([DOMINANCE * MOST - JUST, 900.0], 50.0, ["n1"]),
     ],
     ids=[
         "fits to the noise",
         "just enough",
         "too little",
+        "hardly coarse",
         "the weakest",
         "each beside the other",
         "coarsest",
