@@ -13,6 +13,7 @@ from replay.cli.balance import balance
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
+from replay.cli.correlate import correlate
 from replay.cli.demo import demo
 from replay.cli.export import export
 from replay.cli.forecast import forecast
@@ -20,6 +21,7 @@ from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, restore
 from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
+from replay.cli.printing import print_page
 from replay.cli.record import record
 from replay.cli.register import register
 from replay.cli.serve import serve
@@ -45,8 +47,21 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(init, check, balance, show, export),
-    *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
+    *(init, check, balance, show, print_page, export),
+    *(
+        demo,
+        serve,
+        register,
+        simulate,
+        replay,
+        record,
+        import_model,
+        calibrate,
+        correlate,
+        forecast,
+        close_loop,
+        check_effect,
+    ),
     *(backup, restore, migrate),
 ):
     twin.add_command(command)

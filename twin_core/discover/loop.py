@@ -15,6 +15,8 @@ from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover.confirm import Trial
+from twin_core.discover.dossier import provenance
+from twin_core.discover.driven import driven_heat
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
 from twin_core.discover.long_records import on_all_samples, searched
@@ -146,9 +148,12 @@ def _close_loop(
     witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)
     report |= told_mistakes(found, report, deadline=latest)
-    plots = build_plots(found, before, after, held, predictions, report, witness)
+    driven, lost = driven_heat(found, deadline=latest)
+    report["notices"] += lost
+    plots = build_plots(found, before, after, held, predictions, report, witness, driven)
     report["quality"] = quality_json([*records, *holdout_records])
     plots["quality_strip"] = quality_strip([*records, *holdout_records])
+    report["provenance"] = provenance(spec, [*records, *holdout_records])
     report["elapsed_s"] = time.perf_counter() - begun
     progress(1.0, "done")
     return ClosedLoop(report, after, before, plots)

@@ -23,6 +23,7 @@ def test_the_commands() -> None:
             "check",
             "check-effect",
             "close-loop",
+            "correlate",
             "demo",
             "export",
             "forecast",
@@ -30,7 +31,7 @@ def test_the_commands() -> None:
             "init",
             "migrate",
         ),
-        *("record", "register", "replay", "restore", "serve", "show", "simulate"),
+        *("print", "record", "register", "replay", "restore", "serve", "show", "simulate"),
     ]
 
 
