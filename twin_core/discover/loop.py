@@ -14,11 +14,12 @@ from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.discover import policy
 from twin_core.discover.confirm import Trial
 from twin_core.discover.dossier import provenance
 from twin_core.discover.driven import driven_heat
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
-from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
+from twin_core.discover.judge import NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.mistakes import told_mistakes
 from twin_core.discover.plots import build_plots
@@ -221,5 +222,5 @@ def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    unexplained = found.base.misfit_share() > UNEXPLAINED_SHARE
+    unexplained = found.base.misfit_share() > policy.UNEXPLAINED_SHARE
     return "unexplained" if unexplained else "no_effect_supported"

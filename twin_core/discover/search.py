@@ -12,6 +12,7 @@ import numpy as np
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
+from twin_core.discover import policy
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -44,24 +45,6 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
-
-LEAST_EXCESS = 0.1
-"""Variance of open-loop residuals beyond the noise, in units of that noise, at one sensor at least: else nothing is missing."""
-
-DOMINANCE = 2.0
-"""A name must explain so many times the variance that a lumped network may leave beside it."""
-
-COARSENESS = (1.5, 4.0)
-"""Variance, in units of the sensors' noise, that a lumped network leaves of the readings where it is coarse at all: what stays
-unexplained counts as the former at least, because names may have soaked up the rest, and as the latter, a misfit of two noises,
-at most."""
-
-VISIBLE = 0.05
-"""Variance, in units of the sensors' noise, from which what stays unexplained shows a lumped network to be coarse."""
-
-WIDENED = 1.0
-"""Variance, in units of the sensors' noise, that must stay unexplained beside a finding for pairs and trajectories to be
-asked as well: the coarseness of a lumped network is as large."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -108,17 +91,17 @@ def search(
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: bool(state.trial.excess().max() < LEAST_EXCESS), "how well trajectories fit"):
+    if state.attempt(lambda: bool(state.trial.excess().max() < policy.LEAST_EXCESS), "how well trajectories fit"):
         return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
-    widened = not state.findings or mean_excess(state.trial) > WIDENED
+    widened = not state.findings or mean_excess(state.trial) > policy.WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if not widened or (told and mean_excess(by_heat.trial) <= COARSENESS[1]):
+    if not widened or (told and mean_excess(by_heat.trial) <= policy.MOST_COARSENESS):
         state.join(by_heat)
         return bool(told)
     beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
@@ -247,7 +230,7 @@ def withdraw(state: Search) -> None:
     while state.findings:
         weakest = min(state.findings, key=lambda finding: finding.explained)
         is_named = not all(effect.fallback for effect in weakest.effects)
-        if weakest.explained >= least_explained(mean_excess(state.trial), is_named=is_named):
+        if weakest.explained >= least_explained(mean_excess(state.trial), state.trial.n_samples, is_named=is_named):
             return
         state.findings = [finding for finding in state.findings if finding is not weakest]
         state.rejected.append(replace(weakest.judged, reason=NO_MORE))
@@ -260,15 +243,17 @@ def withdraw(state: Search) -> None:
         state.findings = [_explaining(state, finding) for finding in state.findings]
 
 
-def least_explained(left: float, *, is_named: bool) -> float:
+def least_explained(left: float, n_readings: int, *, is_named: bool) -> float:
     """Return the variance that a finding must explain beside what stays unexplained, both in units of the sensors' noise.
 
-    A heat without a name claims nothing but to predict: beside it, all that stays counts.
+    That a network is coarse at all is seen where more stays than chance leaves of ``n_readings`` independent readings, whose
+    variance has a standard error of sqrt(2 / n). A heat without a name claims nothing but to predict: all that stays counts.
     """
     if not is_named:
-        return DOMINANCE * left
-    least, most = COARSENESS
-    return DOMINANCE * min(max(left, least * min(left / VISIBLE, 1.0)), most)
+        return policy.DOMINANCE * left
+    by_chance = policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
+    shown = min(max(left / by_chance - 1.0, 0.0), 1.0)
+    return policy.DOMINANCE * min(max(left, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
 
 
 def _explaining(state: Search, finding: Finding) -> Finding:
