@@ -54,8 +54,6 @@ class Finding:
 
     judged: Judged
     alternatives: tuple[Judged, ...] = ()
-    explained: float = np.inf
-    """Variance of open-loop residuals that they explain, in units of the sensors' noise, mean over sensors."""
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -166,7 +164,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
                 j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
             ]
             close = tuple(j for j in elsewhere if is_close(j, best))
-            state.findings.append(Finding(own, close, mean_excess(state.trial) - mean_excess(best.trial)))
+            state.findings.append(Finding(own, close))
             state.trial = best.trial
             state.rejected += refused
             return True
