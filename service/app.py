@@ -133,7 +133,7 @@ def create_app(
 
     @contextlib.asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        store = database or Database(settings.database_path)
+        store = database or Database(settings.database)
         try:
             async with _running(settings, store, metrics, make_workbench) as service:
                 app.state.service = service

@@ -18,7 +18,6 @@ CHORES: tuple[tuple[str, Callable[[Connection], int]], ...] = (
     ("deleted samples that can no longer be restored", aside.expire),
     ("twins that were deleted", retention.sweep_gone),
     ("what is older than its twin keeps", retention.sweep_old),
-    ("free pages", retention.vacuum),
 )
 
 
@@ -44,7 +43,7 @@ class Housekeeping:
     async def _run(self) -> None:
         while True:
             self._wake.clear()
-            for what, chore in CHORES:
+            for what, chore in (*CHORES, *self._database.engine.chores):
                 try:
                     await self._finish(what, chore)
                 except Exception as error:  # the next time may be a better one

@@ -116,7 +116,7 @@ class Hub:
         **kwargs: P.kwargs,
     ) -> None:
         """The same, and let somebody hear in the event loop what came of it."""
-        self._database.submit_then(partial(self._after_commit, twin, then), operation, *args, **kwargs)
+        self._database.submit_to(twin, partial(self._after_commit, twin, then), operation, *args, **kwargs)
 
     def _after_commit(self, twin: int, then: Then[Any], made: Made[Any], error: BaseException | None) -> None:
         """Hand an outcome to the event loop; the writer calls this in the order of the commits.

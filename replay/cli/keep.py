@@ -18,7 +18,7 @@ AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the outcom
 @AS_JSON
 def backup(file: Path, database: Path | None, as_json: bool) -> None:
     """Write a consistent copy of the service's database to FILE, also while it serves, and check it by reading all of it."""
-    from service.store.copies import backup as copy
+    from service.store.sqlite.copies import backup as copy
 
     contents = copy(_file(database), file)
     _say({"file": str(file), **vars(contents)}, f"{file}: {contents.words}, checked", as_json)
@@ -33,7 +33,7 @@ def restore(file: Path, database: Path | None, as_json: bool) -> None:
 
     The former database stays beside it under another name.
     """
-    from service.store.copies import restore as put
+    from service.store.sqlite.copies import restore as put
 
     target = _file(database)
     contents, former = put(file, target)
@@ -50,8 +50,8 @@ def migrate(rehearse: bool, database: Path | None, as_json: bool) -> None:
     """Apply the schema steps that the service would apply at its start; --rehearse tries them on a copy, also while it serves."""
     import tempfile
 
-    from service.store import copies
     from service.store.database import Database
+    from service.store.sqlite import copies
 
     path = _file(database)
     folder = path.resolve().parent

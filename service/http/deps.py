@@ -70,7 +70,7 @@ class Service:
         async with self._coming_and_going:
             if self.registry.get(twin.name) is not twin:
                 raise TwinGone(f"twin {twin.key} is gone")
-            made, is_new = await self.database.write(twins.revise, twin.name, given.data)
+            made, is_new = await self.database.write_to(twin.key, twins.revise, twin.name, given.data)
             if is_new:
                 await self.live.remove(twin)
                 self.hub.close(twin.key)
@@ -78,7 +78,7 @@ class Service:
                 entry.know(given.spec)
                 left = int(entry.sensors != twin.sensors)
                 while left:
-                    left = await self.database.write(retention.forget_derived, twin.key)
+                    left = await self.database.write_to(twin.key, retention.forget_derived, twin.key)
                 self.add_twin(made)
                 news = [("twin", {"revision": made.revision})]
                 await self.hub.write(twin.key, outcome.tell, twin.key, news)
@@ -92,7 +92,7 @@ class Service:
             self.registry.remove(twin.name)
             await self.jobs.cancel_twin(twin)
             await self.live.remove(twin)
-            await self.database.write(twins.delete, twin.name)
+            await self.database.write_to(twin.key, twins.delete, twin.name)
             self.hub.close(twin.key)
             self.housekeeping.wake()
 

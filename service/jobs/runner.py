@@ -80,7 +80,7 @@ class Jobs:
         if sum(running.twin == twin.key for running in self._running.values()) >= MOST_WAITING:
             raise Problem(429, f"{MOST_WAITING} jobs of '{twin.name}' have not ended yet; wait for them or cancel some")
         job = uuid.uuid4().hex[:12]
-        row = await self._database.write(jobs.create, twin.key, job, kind, request)
+        row = await self._database.write_to(twin.key, jobs.create, twin.key, job, kind, request)
         running = _Running(twin.key, Cancel())
         self._running[job] = running
         running.task = asyncio.create_task(self._run(twin, row, request, running.cancel))

@@ -219,7 +219,7 @@ class Tracker:
     async def _lift_floor(self, active: Active, from_us: int) -> None:
         """Leave out of what lies behind an instant all but the newest samples."""
         arguments = (self.twin, active.version, self._window, from_us)
-        self.floor_us = await self._database.write(progress.lift_floor, *arguments)
+        self.floor_us = await self._database.write_to(self.twin.key, progress.lift_floor, *arguments)
 
     def _stand(self, position: Position | None) -> None:
         """Go on from a position, up to which the archive was read when the stream stood at its number."""
@@ -310,7 +310,7 @@ class Tracker:
         if self._detour is not None:
             until_us = self._detour.until_us
         arguments = (self.twin, active.version, late_us, until_us)
-        checkpoint = await self._database.write(progress.rewind, *arguments)
+        checkpoint = await self._database.write_to(self.twin.key, progress.rewind, *arguments)
         if self._detour is None and until_us is not None:
             self._detour = _Detour(until_us, before, self._read, 0 if checkpoint is None else checkpoint.n_samples)
         self._stand(None if checkpoint is None else Position.of(checkpoint))
@@ -322,7 +322,9 @@ class Tracker:
         """
         done, back = self._at, detour.back
         if await self._database.read(progress.outdates_inputs, self.twin, detour.read, detour.until_us):
-            checkpoint = await self._database.write(progress.rewind, self.twin, active.version, detour.until_us, None)
+            checkpoint = await self._database.write_to(
+                self.twin.key, progress.rewind, self.twin, active.version, detour.until_us, None
+            )
             self._detour, self._caution = None, Caution()
             self._stand(None if checkpoint is None else Position.of(checkpoint))
             return

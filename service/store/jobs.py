@@ -95,8 +95,9 @@ def begin(connection: Connection, job: str) -> None:
 def report(connection: Connection, job: str, progress: float, message: str) -> None:
     """Note how far a running job is; progress never goes back."""
     connection.execute(
-        "UPDATE job SET progress = max(progress, ?), message = ? WHERE id = ? AND state = 'running'",
-        (progress, message, job),
+        """UPDATE job SET progress = CASE WHEN progress > ? THEN progress ELSE ? END, message = ?
+           WHERE id = ? AND state = 'running'""",
+        (progress, progress, message, job),
     )
 
 

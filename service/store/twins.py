@@ -59,8 +59,9 @@ def register(connection: Connection, name: str, specification: dict[str, Any]) -
     except Missing:
         text = orjson.dumps(specification).decode()
         values = (name, text, now_us())
-        row = connection.execute("INSERT INTO twin (name, specification, created_us) VALUES (?, ?, ?)", values)
-        connection.execute("INSERT INTO head (twin) VALUES (?)", (row.lastrowid,))
+        query = "INSERT INTO twin (name, specification, created_us) VALUES (?, ?, ?) RETURNING id"
+        row = connection.execute(query, values).fetchone()
+        connection.execute("INSERT INTO head (twin) VALUES (?)", row)
         return get(connection, name), True
     if canonical(known.specification) != canonical(specification):
         raise Conflicting(

@@ -207,7 +207,7 @@ async def discard(
     stop: Annotated[str | None, Query(description="First instant after the last one that goes.")] = None,
 ) -> Deletion:
     """Delete samples in quarantine; it can be undone for a day."""
-    made = await service.database.write(aside.discard, twin.key, len(twin.channels), *span(start, stop))
+    made = await service.database.write_to(twin.key, aside.discard, twin.key, len(twin.channels), *span(start, stop))
     log.warning("samples in quarantine were deleted", extra={"twin": twin.name, **made.wire()})
     return Deletion(**made.wire())
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from service.store import migrations
 from service.store.database import Database
 from service.store.errors import StoreError
+from service.store.sqlite import migrations
 
 
 @pytest.fixture
