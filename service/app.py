@@ -10,6 +10,8 @@ from fastapi import Depends, FastAPI
 
 from service.core_workbench import CoreWorkbench
 from service.dispatch import Dispatch
+from service.fleet.member import Member, join
+from service.fleet.ownership import Alone
 from service.housekeeping import Housekeeping
 from service.http import problems
 from service.http.audit import Audit
@@ -53,14 +55,17 @@ ROUTERS = (
 
 
 @contextlib.asynccontextmanager
-async def _running(
+async def running(
     settings: Settings, database: Database, metrics: Metrics, workbench: MakeWorkbench
 ) -> AsyncIterator[Service]:
     """Start everything that works in the background, and stop it in the opposite order."""
-    interrupted = await database.write(job_table.fail_interrupted)
-    if interrupted:
-        log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
-    hub = Hub(database, metrics, settings.stream_buffer)
+    leases, bus = join(database, settings)
+    owners = leases or Alone()
+    if not database.is_shared:
+        interrupted = await database.write(job_table.fail_interrupted)
+        if interrupted:
+            log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
+    hub = Hub(database, metrics, settings.stream_buffer, None if bus is None else bus.hint)
     live_state = Live(
         database,
         hub,
@@ -69,17 +74,24 @@ async def _running(
         settings.false_alarm_rate,
         settings.limit_horizon_s,
         settings.assimilate_samples,
+        owners,
     )
     executor = ProcessPerTask(settings.job_workers, settings.job_deadline_s, settings.job_memory_mib)
     rooms = (database, hub, metrics, workbench, executor)
-    runner = Jobs(*rooms, settings.job_workers, settings.job_values, live_state.model_changed)
+    runner = Jobs(
+        *rooms,
+        settings.job_workers,
+        settings.job_values,
+        live_state.model_changed,
+        lambda twin: service.find_key(twin),
+    )
     intake = Intake(hub, live_state, metrics, settings.clock_tolerance_s)
-    housekeeping = Housekeeping(database)
-    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner, housekeeping)
+    housekeeping = Housekeeping(database, owners)
+    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner, housekeeping, owners)
     for twin in await database.read(twin_table.select):
         service.add_twin(twin)
-    dispatch = Dispatch(database)
-    silence = Silence(service.registry, live_state, hub)
+    dispatch = Dispatch(database, owners)
+    silence = Silence(service.registry, live_state, hub, owners)
     schedule = Schedule(
         database,
         service.registry,
@@ -88,11 +100,17 @@ async def _running(
         settings.anomaly_patience_s,
         settings.refutation_rate,
         live_state.evidence,
+        owners,
     )
+    member = None if leases is None or bus is None else Member(service, bus, leases)
+    if member is not None:
+        await member.joined()
     try:
         yield service
     finally:
         hub.close()
+        if member is not None:
+            await member.close()
         await silence.close()
         await schedule.close()
         await dispatch.close()
@@ -135,7 +153,7 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         store = database or Database(settings.database)
         try:
-            async with _running(settings, store, metrics, make_workbench) as service:
+            async with running(settings, store, metrics, make_workbench) as service:
                 app.state.service = service
                 yield
         finally:

@@ -43,7 +43,12 @@ class Settings(BaseSettings):
     stream_buffer: int = Field(
         20_000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
     )
-    job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
+    job_workers: int = Field(
+        1,
+        ge=0,
+        le=64,
+        description="Calibrations and diagnoses that this process runs at the same time; 0: others do (`twin worker`).",
+    )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
     job_values: int = Field(
         250_000,

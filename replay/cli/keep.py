@@ -68,6 +68,33 @@ def migrate(rehearse: bool, database: Path | None, as_json: bool) -> None:
     )
 
 
+@click.command(
+    "migrate-store",
+    cls=Command,
+    short_help="Move everything to another database.",
+    example="twin migrate-store sqlite:///thermal-twin.sqlite3 postgresql://twin@db/twin",
+)
+@click.argument("source", metavar="FROM")
+@click.argument("target", metavar="TO")
+@AS_JSON
+def migrate_store(source: str, target: str, as_json: bool) -> None:
+    """Copy the database FROM to the empty database TO, both given as for TWIN_DATABASE_URL, and compare checksums.
+
+    The service must not run. FROM stays as it is. A password is best kept in PGPASSWORD or ~/.pgpass.
+    """
+    from replay.cli.console import print_line
+    from service.settings import read_settings
+    from service.store.transfer import transfer
+
+    origin, goal = (read_settings(host="127.0.0.1", database_url=url).database for url in (source, target))
+    moved = transfer(origin, goal)
+    if not as_json:
+        for one in moved:
+            print_line(f"{one.table:18}{one.rows:>12,} rows  {one.sha256[:16]}")
+    rows = sum(one.rows for one in moved)
+    _say({"tables": [vars(one) for one in moved]}, f"{rows:,} rows, checksums agree", as_json)
+
+
 def _file(database: Path | None) -> Path:
     from service.settings import read_settings
 

@@ -17,7 +17,7 @@ from replay.cli.demo import demo
 from replay.cli.export import export
 from replay.cli.forecast import forecast
 from replay.cli.import_model import import_model
-from replay.cli.keep import backup, migrate, restore
+from replay.cli.keep import backup, migrate, migrate_store, restore
 from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
 from replay.cli.record import record
@@ -47,7 +47,7 @@ def twin(traceback: bool) -> None:
 for command in (
     *(init, check, balance, show, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
-    *(backup, restore, migrate),
+    *(backup, restore, migrate, migrate_store),
 ):
     twin.add_command(command)
 

@@ -1,6 +1,6 @@
 """What a database must be able to do so that the store can run on it; SQLite and PostgreSQL are the two that can."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol, TypeVar
 
 from service.store.connection import Connection
@@ -54,6 +54,9 @@ class Engine(Protocol):
 
     def refusal(self, error: Exception) -> Exception:
         """Return what the caller is told about a fault."""
+
+    def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
+        """Go on counting behind what was copied: table -> the column whose numbers the database hands out."""
 
     def close(self) -> None:
         """Let go of everything."""

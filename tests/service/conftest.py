@@ -33,6 +33,8 @@ SPEC: dict[str, Any] = {
     "loads": [{"channel": "Q_px", "node": "px"}],
 }
 
+STORE, NAMED = (os.environ.get(name) for name in ("TWIN_TEST_STORE", "TWIN_TEST_POSTGRES_URL"))
+"""Read before tests empty the environment of what is the service's."""
 MakeClient = Callable[..., AppClient]
 
 
@@ -86,9 +88,8 @@ def standing_workers() -> Iterator[StandingWorkers]:
 @pytest.fixture(scope="session")
 def postgres_url() -> Iterator[str]:
     """A PostgreSQL server: the one that is named, or one of our own."""
-    named = os.environ.get("TWIN_TEST_POSTGRES_URL")
-    if named:
-        yield named
+    if NAMED:
+        yield NAMED
         return
     with contextlib.ExitStack() as stack:
         try:
@@ -108,7 +109,7 @@ def postgres(postgres_url: str) -> Iterator[str]:
 @pytest.fixture
 def database_url(tmp_path: Path, request: pytest.FixtureRequest) -> str:
     """An empty database: a SQLite file, or PostgreSQL where ``TWIN_TEST_STORE`` says so."""
-    if os.environ.get("TWIN_TEST_STORE") == "postgres":
+    if STORE == "postgres":
         return str(request.getfixturevalue("postgres"))
     return f"sqlite:///{tmp_path / 'twin.sqlite3'}"
 

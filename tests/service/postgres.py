@@ -16,6 +16,7 @@ from typing import Self
 from urllib.parse import urlsplit, urlunsplit
 
 import psycopg
+import pytest
 
 NOBODY = 65534
 """PostgreSQL refuses to run as root; then it runs as this user."""
@@ -128,3 +129,14 @@ def fresh_database(server_url: str) -> Iterator[str]:
             yield urlunsplit(urlsplit(server_url)._replace(path=f"/{name}"))
         finally:
             connection.execute(f"DROP DATABASE {name} WITH (FORCE)")  # type: ignore[call-overload]
+
+
+STORES = ("sqlite", "postgres")
+"""What a test of the store's contract is run on."""
+
+
+def place_of(request: pytest.FixtureRequest, folder: Path) -> Path | str:
+    """Return where an empty store of the kind that a fixture is asked for lies."""
+    if request.param == "postgres":
+        return str(request.getfixturevalue("postgres"))
+    return folder / "t.sqlite3"

@@ -61,7 +61,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     require(request, Role.ingest)
     refuse_unknown(request)
     service: Service = request.app.state.service
-    entry = service.registry.get(twin)
+    entry = await service.find(twin)
     body = (await request.receive()).get("body", b"")  # whole: see Bodies
     parse = _parser(request.headers.get("content-type", ""))
     if len(body) > PARSE_APART_BYTES:

@@ -1,10 +1,9 @@
 """A PostgreSQL server: connections that speak the store's dialect, and transactions that many processes share."""
 
-import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -69,11 +68,11 @@ def connect(url: str, *, read_only: bool = False, autocommit: bool = True) -> "p
 def _without_secrets(error: Exception, url: str) -> str:
     """Return the last line of an error without the password, wherever it stands."""
     said = " ".join(str(error).split())
-    with contextlib.suppress(psycopg.ProgrammingError):
+    try:
         password = psycopg.conninfo.conninfo_to_dict(url).get("password")
-        if password:
-            said = said.replace(str(password), "***")
-    return said[:300]
+    except psycopg.ProgrammingError:
+        return "it is no URL of a PostgreSQL database"
+    return (said.replace(str(password), "***") if password else said)[:300]
 
 
 class PostgresSession:
@@ -195,6 +194,14 @@ class PostgresEngine:
             log.error("the database does not answer", extra={"reason": _without_secrets(error, self.url)})
             return Unavailable("the database cannot be reached; send it again: what is stored already is recognised")
         return error
+
+    def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
+        """Let each sequence go on behind the rows that were copied."""
+        for table, column in keys.items():
+            query = (
+                f"SELECT setval(pg_get_serial_sequence('{table}', '{column}'), greatest(max({column}), 1)) FROM {table}"
+            )
+            connection.execute(query)
 
     def close(self) -> None:
         """Close the readers' connections."""

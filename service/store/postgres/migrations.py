@@ -228,6 +228,7 @@ ARRAYS = {
 """Columns of binary numbers: to look for repetitions in them costs time and finds none."""
 
 FLEET = """
+    ALTER TABLE head ADD COLUMN epoch BIGINT NOT NULL DEFAULT 0;
     ALTER TABLE job ADD COLUMN attempt INTEGER NOT NULL DEFAULT 0;
     ALTER TABLE job ADD COLUMN worker TEXT;
     ALTER TABLE job ADD COLUMN beat_us BIGINT;

@@ -4,7 +4,7 @@ import contextlib
 import logging
 import sqlite3
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -107,6 +107,9 @@ class SqliteEngine:
             log.error("the disk is full; nothing of the write was stored", extra={"sqlite": name})
             return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
         return error
+
+    def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
+        """Do nothing: SQLite looks at the rows itself."""
 
     def close(self) -> None:
         """Close the readers' connections and release the file."""

@@ -29,6 +29,7 @@ def test_the_commands() -> None:
             "import",
             "init",
             "migrate",
+            "migrate-store",
         ),
         *("record", "register", "replay", "restore", "serve", "show", "simulate"),
     ]
