@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
+.PHONY: demo test test-fast test-fleet check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -30,6 +30,9 @@ test: $(STAMP)
 
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow and not e2e and not browser"
+
+test-fleet: $(STAMP)
+	$(BIN)/pytest -m fleet tests/service/fleet
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .

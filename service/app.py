@@ -23,7 +23,7 @@ from service.http.observe import Observe
 from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
 from service.http.shortcut import Shortcut
 from service.intake import Intake
-from service.jobs.executor import ProcessPerTask
+from service.jobs.executor import ProcessPerTask, Tasks
 from service.jobs.runner import Jobs
 from service.jobs.schedule import Schedule
 from service.live.live import Live
@@ -76,7 +76,7 @@ async def running(
         settings.assimilate_samples,
         owners,
     )
-    executor = ProcessPerTask(settings.job_workers, settings.job_deadline_s, settings.job_memory_mib)
+    executor = _executor(settings)
     rooms = (database, hub, metrics, workbench, executor)
     runner = Jobs(
         *rooms,
@@ -117,6 +117,16 @@ async def running(
         await housekeeping.close()
         await runner.close()
         await live_state.close()
+
+
+def _executor(settings: Settings) -> Tasks:
+    """Return what computes jobs."""
+    workers = max(settings.job_workers, 1)
+    if settings.executor == "process":
+        return ProcessPerTask(workers, settings.job_deadline_s, settings.job_memory_mib)
+    from service.jobs.dask import DaskTasks
+
+    return DaskTasks(settings.executor.replace("dask://", "tcp://"), workers, settings.job_deadline_s)
 
 
 def _describe_access(app: FastAPI) -> None:

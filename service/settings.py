@@ -49,6 +49,11 @@ class Settings(BaseSettings):
         le=64,
         description="Calibrations and diagnoses that this process runs at the same time; 0: others do (`twin worker`).",
     )
+    executor: str = Field(
+        "process",
+        pattern=r"^(process|dask://[^/]+)$",
+        description="Where jobs compute: `process`, or `dask://HOST:PORT`, the scheduler of a Dask cluster.",
+    )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
     job_values: int = Field(
         250_000,

@@ -24,6 +24,7 @@ from replay.cli.record import record
 from replay.cli.register import register
 from replay.cli.serve import serve
 from replay.cli.simulate import simulate
+from replay.cli.worker import worker
 from replay.errors import ReplayError
 from twin_core import __version__
 from twin_core.errors import NoSolutionError, TwinError
@@ -47,7 +48,7 @@ def twin(traceback: bool) -> None:
 for command in (
     *(init, check, balance, show, export),
     *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
-    *(backup, restore, migrate, migrate_store),
+    *(backup, restore, migrate, migrate_store, worker),
 ):
     twin.add_command(command)
 

@@ -13,7 +13,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Self
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import quote
 
 import psycopg
 import pytest
@@ -121,14 +121,14 @@ def own_server(*settings: str) -> Iterator[Postgres]:
 
 @contextlib.contextmanager
 def fresh_database(server_url: str) -> Iterator[str]:
-    """Yield the URL of an empty database of a server, and drop it at the end."""
+    """Yield the URL of an empty schema of a server's database, which is made and dropped much quicker than a database."""
     name = f"twin_{uuid.uuid4().hex[:12]}"
     with psycopg.connect(server_url, autocommit=True) as connection:
-        connection.execute(f"CREATE DATABASE {name}")  # type: ignore[call-overload]
+        connection.execute(f"CREATE SCHEMA {name}")  # type: ignore[call-overload]
         try:
-            yield urlunsplit(urlsplit(server_url)._replace(path=f"/{name}"))
+            yield f"{server_url}{'&' if '?' in server_url else '?'}options={quote(f'-c search_path={name}')}"
         finally:
-            connection.execute(f"DROP DATABASE {name} WITH (FORCE)")  # type: ignore[call-overload]
+            connection.execute(f"DROP SCHEMA {name} CASCADE")  # type: ignore[call-overload]
 
 
 STORES = ("sqlite", "postgres")

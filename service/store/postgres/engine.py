@@ -58,10 +58,11 @@ def _translated(query: str) -> str:
 
 def connect(url: str, *, read_only: bool = False, autocommit: bool = True) -> "psycopg.Connection[Any]":
     """Return a connection of the driver; Unavailable if the server cannot be reached, without what is secret of the URL."""
-    options = OPTIONS + (" -c default_transaction_read_only=on" if read_only else "")
     try:
+        own = psycopg.conninfo.conninfo_to_dict(url).get("options", "")
+        options = f"{OPTIONS}{' -c default_transaction_read_only=on' if read_only else ''} {own}"
         return psycopg.connect(url, autocommit=autocommit, options=options, **SETTINGS)  # type: ignore[arg-type]
-    except psycopg.OperationalError as error:
+    except (psycopg.OperationalError, psycopg.ProgrammingError) as error:
         raise Unavailable(f"the database cannot be reached: {_without_secrets(error, url)}") from None
 
 

@@ -31,7 +31,7 @@ def test_the_commands() -> None:
             "migrate",
             "migrate-store",
         ),
-        *("record", "register", "replay", "restore", "serve", "show", "simulate"),
+        *("record", "register", "replay", "restore", "serve", "show", "simulate", "worker"),
     ]
 
 
