@@ -4,9 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
+GROUND := $(VENV)/.ground
+DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-fleet check bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
+.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -19,6 +21,15 @@ $(BENCH): $(STAMP)
 	$(BIN)/pip install --quiet --editable ".[bench,neural]"
 	touch $@
 
+$(GROUND): $(STAMP)
+	$(BIN)/pip install --quiet --editable ".[dev,neural,ground]"
+	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/openmct openmct@4
+	touch $@
+
+$(DOCS): $(STAMP)
+	$(BIN)/pip install --quiet --editable ".[docs]"
+	touch $@
+
 demo: $(STAMP)
 	$(BIN)/twin demo --out demo-out
 
@@ -26,10 +37,10 @@ demo: $(STAMP)
 PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
-	$(PYTEST)
+	$(PYTEST) -m "not ground and not fleet"
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow and not e2e and not browser"
+	$(PYTEST) -m "not slow and not e2e and not browser and not ground and not fleet"
 
 test-fleet: $(STAMP)
 	$(BIN)/pytest -m fleet tests/service/fleet
@@ -38,6 +49,9 @@ check: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+docs: $(DOCS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks
@@ -72,6 +86,10 @@ bench-service: $(STAMP)
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b
+
+# Beside the products of a control room themselves: Yamcs, Open MCT, Prometheus. What is not installed is skipped.
+test-ground: $(GROUND)
+	$(BIN)/pytest -m ground
 
 serve: $(STAMP)
 	$(BIN)/twin serve

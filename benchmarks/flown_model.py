@@ -149,7 +149,7 @@ def loop_row(data: Path, deadline_s: float, *, held: bool) -> list[str]:
     )
     before, after = (f"{loop.report[when]['rmse_K']:.2f}" for when in ("before", "after"))
     if not held:
-        return ["calibrated on flight a for a second, no search", before, "", "", ""]
+        return ["recalibrated on flight a within a second, no search", before, "", "", ""]
     said = "; ".join(sentence(finding) for finding in loop.report["findings"]) or "nothing"
     return ["as it flew", before, after, loop.report["verdict"], said]
 

@@ -31,6 +31,7 @@ def write_mcap(
     columns: Mapping[str, NDArray[np.float64]],
     units: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
+    attachments: Mapping[str, bytes] | None = None,
 ) -> None:
     """Write columns to an MCAP file, messages in the order of time; the file appears whole or not at all.
 
@@ -46,6 +47,8 @@ def write_mcap(
         Noted in the schema and in the channel's metadata.
     metadata
         Text pairs kept in the file.
+    attachments
+        File name -> content of files that are kept in it.
 
     Raises
     ------
@@ -55,7 +58,8 @@ def write_mcap(
     target = Path(path)
     recording = Recording(time_ns, columns, units or {}, metadata or {})
     _check_writable(target, recording)
-    with McapWriter(target, recording.columns, recording.units, recording.metadata) as writer:
+    told = (recording.columns, recording.units, recording.metadata)
+    with McapWriter(target, *told, attachments=attachments) as writer:
         rows = [(topic, column.tolist()) for topic, column in recording.columns.items()]
         for row, instant_ns in enumerate(recording.time_ns.tolist()):
             for topic, values in rows:

@@ -21,7 +21,8 @@ VALUE = "value"
 class McapWriter:
     """An MCAP file in the making. Use it as a context manager: the file appears whole when it ends, or not at all.
 
-    ``keep`` lets it appear even if an error ends it: a recording of what happened is worth having up to there.
+    ``attachments``, file name -> content, tell what the channels are: the specification, or the scenario. ``keep`` lets the file
+    appear even if an error ends it: a recording of what happened is worth having up to there.
     """
 
     def __init__(
@@ -31,12 +32,14 @@ class McapWriter:
         units: Mapping[str, str] | None = None,
         metadata: Mapping[str, str] | None = None,
         *,
+        attachments: Mapping[str, bytes] | None = None,
         keep: bool = False,
     ) -> None:
         """Prepare to write ``topics``; RecordingError on entry if the file cannot be written."""
         self._target, self._keep = Path(path), keep
         self._partial = self._target.with_name(f".{self._target.name}.{os.getpid()}.partial")
         self._topics, self._units, self._metadata = list(topics), dict(units or {}), dict(metadata or {})
+        self._attachments = dict(attachments or {})
         self._channels: dict[str, int] = {}
         self.count = 0
 
@@ -50,6 +53,9 @@ class McapWriter:
         self._writer.start(profile="", library="thermal-twin")
         if self._metadata:
             self._writer.add_metadata(METADATA_NAME, self._metadata)
+        for name, data in self._attachments.items():
+            media = "application/json" if name.endswith(".json") else "application/yaml"
+            self._writer.add_attachment(0, 0, name, media, data)
         self._channels = {topic: self._add_channel(topic) for topic in self._topics}
         return self
 
@@ -93,14 +99,18 @@ class McapWriter:
     def _add_channel(self, topic: str) -> int:
         """Register one topic and its schema; return the channel's number."""
         unit = self._units.get(topic)
+        told = {"type": "number", "description": f"{topic} in {unit}" if unit else topic} | (
+            {"unit": unit} if unit else {}
+        )
+        name = f"{SCHEMA_NAME}.{topic}"  # viewers look schemas up by name, and each channel has its own unit
         schema = {
             "$schema": "https://json-schema.org/draft/2020-12/schema",
-            "title": SCHEMA_NAME,
+            "title": name,
             "type": "object",
-            "properties": {VALUE: {"type": "number", "description": f"{topic} in {unit}" if unit else topic}},
+            "properties": {VALUE: told},
             "required": [VALUE],
         }
-        schema_id = self._writer.register_schema(SCHEMA_NAME, "jsonschema", orjson.dumps(schema))
+        schema_id = self._writer.register_schema(name, "jsonschema", orjson.dumps(schema))
         return int(self._writer.register_channel(topic, "json", schema_id, {"unit": unit} if unit else {}))
 
     def _refusal(self, error: OSError) -> RecordingError:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,7 @@ class CoreWorkbench:
             false_alarm_rate=task.false_alarm_rate,
             progress=progress,
         )
+        loop.report["document"] = {"date": datetime.now(UTC).date().isoformat()}
         before, after = loop.report["before"]["rmse_K"], loop.report["after"]["rmse_K"]
         validation = {"rmse_K": after, "before_rmse_K": before, "on": "the hold-out of the diagnosis"}
         outcome = _outcome(loop.model, validation, None)

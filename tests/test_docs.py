@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+import thermal_twin
 from replay.cli.main import main, twin
 from service.app import ROUTERS
 from service.settings import Settings
@@ -35,17 +36,25 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("name", twin.commands)
+def commands() -> dict[str, click.Command]:
+    """Return every command by its words, those of groups included."""
+    found: dict[str, click.Command] = {}
+    for name, command in twin.commands.items():
+        found |= {f"{name} {word}": part for word, part in getattr(command, "commands", {}).items()} or {name: command}
+    return found
+
+
+@pytest.mark.parametrize("name", commands())
 def test_every_option(name: str) -> None:
     text = section("cli.md", f"twin {name}")
-    for parameter in twin.commands[name].params:
+    for parameter in commands()[name].params:
         if isinstance(parameter, click.Option):
             for flag in parameter.opts:
                 assert f"`{flag}" in text, f"docs/cli.md: twin {name} {flag} is missing"
 
 
 def test_no_option_that_is_gone() -> None:
-    for name, command in twin.commands.items():
+    for name, command in commands().items():
         known = {flag for parameter in command.params for flag in parameter.opts}
         rows = re.findall(r"^\| `(--[a-z-]+)", section("cli.md", f"twin {name}"), re.MULTILINE)
         assert set(rows) <= known, name
@@ -125,6 +134,18 @@ def test_every_link_leads_somewhere() -> None:
         for target in re.findall(r"\]\(([^)#]+)", path.read_text()):
             if "://" not in target:
                 assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_the_reference_lists_every_function_of_the_facade() -> None:
+    page = (ROOT / "docs" / "api" / "thermal_twin.md").read_text()
+    for name in thermal_twin.__all__:
+        assert name == "__version__" or re.search(rf"\b{name}\b", page) or name == "TwinError", name
+
+
+def test_every_page_stands_in_the_site() -> None:
+    """What mkdocs.yml lists is there, and every page is listed."""
+    listed = set(re.findall(r"^ +- ([a-z0-9_/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert listed == {str(path.relative_to(ROOT / "docs")) for path in (ROOT / "docs").rglob("*.md")}
 
 
 def test_every_decision_follows_the_form() -> None:

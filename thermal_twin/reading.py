@@ -53,12 +53,14 @@ def read(path: str | Path, spec: TwinSpec | None = None) -> TwinSpec | Calibrate
     return load_spec(path)
 
 
-def save(what: CalibratedModel | ClosedLoop, path: str | Path) -> Path:
+def save(what: CalibratedModel | ClosedLoop, path: str | Path, *, author: str = "") -> Path:
     """Write a model to a JSON file, or a closed loop's report, page and model into a folder; return where.
 
-    The model that stands in it is read again by ``read``.
+    The page carries today's date and the ``author``; a browser prints it as a report to sign. The model that stands in the folder
+    is read again by ``read``.
     """
     import json
+    from datetime import UTC, datetime
 
     path = Path(path)
     if isinstance(what, CalibratedModel):
@@ -68,6 +70,7 @@ def save(what: CalibratedModel | ClosedLoop, path: str | Path) -> Path:
     from twin_core.files import make_folder
 
     make_folder(path)
+    what.report["document"] = {"date": datetime.now(UTC).date().isoformat(), "author": author}
     write_text(path / "model.json", json.dumps(what.model.to_json(), indent=2))
     write_text(path / "report.json", json.dumps(what.report, indent=2))
     write_text(path / "report.html", render(what.report, what.plots))

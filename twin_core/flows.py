@@ -1,4 +1,7 @@
-"""The heat balance of one moment, told flow by flow: what an operator wants to see drawn on the network."""
+"""The heat balance of a moment or a stretch of time, told flow by flow: what one wants to see drawn on the network."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -45,23 +48,48 @@ def heat_flows(model: CalibratedModel, record: Record, state: Json) -> Json:
     """
     network = model.network()
     temperatures = np.array(state["mean_K"], dtype=np.float64)
-    along = _moment(model, network, record, temperatures)
+    return flows_along(model, network, _moment(model, network, record, temperatures))
+
+
+def flows_along(model: CalibratedModel, network: Network, along: Along, weights: FloatArray | None = None) -> Json:
+    """Return temperatures and heat flows as :func:`heat_flows` does, averaged over points of a trajectory.
+
+    Parameters
+    ----------
+    model, network
+        A calibrated model and its network.
+    along
+        The points; both ends of successive steps where a thermostat is to be followed.
+    weights : (n_points,)
+        Of the points in the mean; alike by default.
+    """
     values = network.parameters.values
-    boundaries = dict(zip(network.layout.boundaries, along.boundaries_K[0].tolist(), strict=True))
-    known = dict(zip(network.nodes, temperatures.tolist(), strict=True)) | boundaries
-    net = evaluate_balance(network, values, along).heat_W[0]
+    mean = _Mean(weights)
+    known = {name: along.temperatures_K[:, i] for i, name in enumerate(network.nodes)}
+    known |= {name: along.boundaries_K[:, i] for i, name in enumerate(network.layout.boundaries)}
+    net = mean(evaluate_balance(network, values, along).heat_W)
     read = {network.nodes[i] for i in network.sensor_node}
     return {
         "nodes": [
-            {"id": name, "temperature_K": known[name], "heat_W": float(net[i]), "sensed": name in read}
+            {"id": name, "temperature_K": float(mean(known[name])), "heat_W": float(net[i]), "sensed": name in read}
             for i, name in enumerate(network.nodes)
         ],
-        "boundaries": [{"id": name, "temperature_K": value} for name, value in boundaries.items()],
-        "links": [*_conductors(model, known), *_radiators(model, known), *_radiation(model, known)],
-        "heaters": _heaters(model, network, along, values),
-        "loads": _loads(model, network, along, values),
-        "effects": _effects(model, network, along),
+        "boundaries": [{"id": name, "temperature_K": float(mean(known[name]))} for name in network.layout.boundaries],
+        "links": [*_conductors(model, known, mean), *_radiators(model, known, mean), *_radiation(model, known, mean)],
+        "heaters": _heaters(model, network, along, mean),
+        "loads": _loads(model, network, along, mean),
+        "effects": _effects(model, network, along, mean),
     }
+
+
+@dataclass(frozen=True)
+class _Mean:
+    """The mean over points, weighted or not."""
+
+    weights: FloatArray | None
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        return np.asarray(np.average(values, axis=0, weights=self.weights), dtype=np.float64)
 
 
 def _moment(model: CalibratedModel, network: Network, record: Record, temperatures_K: FloatArray) -> Along:
@@ -78,20 +106,20 @@ def _moment(model: CalibratedModel, network: Network, record: Record, temperatur
     )
 
 
-def _into_nodes(network: Network, term: Term, along: Along, values: FloatArray) -> FloatArray:
+def _into_nodes(network: Network, term: Term, along: Along, mean: _Mean) -> FloatArray:
     """Return the heat of one term into every node, (n_nodes,)."""
-    part = term.evaluate(along, values[network.term_index(term)])
+    part = term.evaluate(along, network.parameters.values[network.term_index(term)])
     heat = np.zeros(len(network.nodes))
-    heat[np.asarray(part.nodes)] += part.heat_W[0]
+    np.add.at(heat, np.asarray(part.nodes), mean(part.heat_W))
     return heat
 
 
-def _conductors(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]:
+def _conductors(model: CalibratedModel, known_K: Mapping[str, FloatArray], mean: _Mean) -> list[Json]:
     links = []
     for conductor in model.spec.conductors:
         first, second = conductor.between
         conductance = model.values[conductor.name]
-        heat_W = conductance * (known_K[first] - known_K[second])
+        heat_W = float(mean(conductance * (known_K[first] - known_K[second])))
         link: Json = {"kind": "conductor", "ends": [first, second], "heat_W": heat_W}
         if conductor.into is not None:
             source = first if conductor.into == second else second
@@ -101,53 +129,54 @@ def _conductors(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]
     return links
 
 
-def _radiators(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]:
+def _radiators(model: CalibratedModel, known_K: Mapping[str, FloatArray], mean: _Mean) -> list[Json]:
     links = []
     for radiator in model.spec.radiators:
         area_m2 = radiator.emissivity * radiator.area_m2
-        heat_W = STEFAN_BOLTZMANN_W_PER_M2_K4 * area_m2 * (known_K[radiator.node] ** 4 - known_K[radiator.sink] ** 4)
+        driving = known_K[radiator.node] ** 4 - known_K[radiator.sink] ** 4
+        heat_W = float(mean(STEFAN_BOLTZMANN_W_PER_M2_K4 * area_m2 * driving))
         link = {"kind": "radiator", "ends": [radiator.node, radiator.sink], "heat_W": heat_W}
         links.append({**link, "emissive_area_m2": area_m2})
     return links
 
 
-def _radiation(model: CalibratedModel, known_K: dict[str, float]) -> list[Json]:
+def _radiation(model: CalibratedModel, known_K: Mapping[str, FloatArray], mean: _Mean) -> list[Json]:
     links = []
     for coupling in model.spec.radiation:
         first, second = coupling.between
         area_m2 = model.values[coupling.name]
-        heat_W = STEFAN_BOLTZMANN_W_PER_M2_K4 * area_m2 * (known_K[first] ** 4 - known_K[second] ** 4)
+        heat_W = float(mean(STEFAN_BOLTZMANN_W_PER_M2_K4 * area_m2 * (known_K[first] ** 4 - known_K[second] ** 4)))
         links.append({"kind": "radiation", "ends": [first, second], "heat_W": heat_W, "exchange_area_m2": area_m2})
     return links
 
 
-def _heaters(model: CalibratedModel, network: Network, along: Along, values: FloatArray) -> list[Json]:
+def _heaters(model: CalibratedModel, network: Network, along: Along, mean: _Mean) -> list[Json]:
     """Return the declared heaters, whose terms stand behind those of the loads; a thermostat's by what its memory says."""
     n_terms = len(declared_terms(network.layout))
     terms = network.terms[n_terms - len(model.spec.heaters) : n_terms]
     found = []
     for heater, term in zip(model.spec.heaters, terms, strict=True):
-        into = _into_nodes(network, term, along, values)
+        into = _into_nodes(network, term, along, mean)
         found.append({"node": heater.node, "heat_W": float(into[network.layout.node(heater.node)])})
     return found
 
 
-def _loads(model: CalibratedModel, network: Network, along: Along, values: FloatArray) -> list[Json]:
+def _loads(model: CalibratedModel, network: Network, along: Along, mean: _Mean) -> list[Json]:
     """Return the declared loads, whose terms stand at the end of the declared ones and in their order."""
     loads = model.spec.loads
     declared = [term for term in network.terms if hasattr(term, "channel")][: len(loads)]
     found = []
     for load, term in zip(loads, declared, strict=True):
-        heat_W = float(_into_nodes(network, term, along, values).sum())
+        heat_W = float(_into_nodes(network, term, along, mean).sum())
         found.append({"channel": load.channel, "node": load.node, "heat_W": heat_W})
     return found
 
 
-def _effects(model: CalibratedModel, network: Network, along: Along) -> list[Json]:
+def _effects(model: CalibratedModel, network: Network, along: Along, mean: _Mean) -> list[Json]:
     """Return each effect with the heat that it brings into the nodes; effects on readings bring none."""
     found = []
     for effect in model.effects:
-        heat = effect_heat_W(effect, network, along)[0]
+        heat = mean(effect_heat_W(effect, network, along))
         data = effect_to_json(effect)
         into = {name: float(q) for name, q in zip(network.nodes, heat, strict=True) if q != 0.0}
         found.append({"effect": data["effect"], "where": data["where"], "heat_W": into})

@@ -47,6 +47,8 @@ VERDICTS = {
 )
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
+@click.option("--author", default="", help="Who signs the report: printed on it.")
+@click.option("--pdf", is_flag=True, help="Print the report too, as report.pdf; needs Chromium or Chrome.")
 @effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def close_loop(
@@ -59,6 +61,8 @@ def close_loop(
     deadline: float | None,
     no_masking: bool,
     out: Path,
+    author: str,
+    pdf: bool,
     as_json: bool,
 ) -> None:
     """Calibrate, find what the model lacks, add it, and measure the error on telemetry kept back.
@@ -66,7 +70,9 @@ def close_loop(
     Exits with 0 whenever it reaches a verdict, also when the verdict is that no effect is supported.
     """
     from replay.cli.console import notify, print_line, progress_bar, to_json
+    from replay.cli.printing import as_pdf
     from replay.cli.recordings import check_apart, load_records
+    from replay.cli.signed import document
     from twin_core.discover import close_loop as run
     from twin_core.network.spec_io import load_spec
 
@@ -86,14 +92,17 @@ def close_loop(
             deadline_s=deadline,
             progress=progress,
         )
+    loop.report["document"] = document(author, [spec_file, *telemetry, *holdout_telemetry])
     _save(loop, out)
+    if pdf:
+        as_pdf(out / "report.html", out / "report.pdf")
     of_records = [notice for record in (*records, *held_out) for notice in record.notices]
     notify(list(dict.fromkeys([*of_records, *loop.report["notices"]])))
     if as_json:
         print_line(to_json(loop.report).rstrip())
     else:
         print_report(loop.report)
-        print_line(f"wrote {out}/report.html, report.json, model.json")
+        print_line(f"wrote {out}/report.html, {'report.pdf, ' if pdf else ''}report.json, model.json")
 
 
 def _check(

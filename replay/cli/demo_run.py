@@ -100,7 +100,7 @@ def run_demo(effect: str, seed: int, out: Path) -> Iterator[Outcome]:
     begun = time.perf_counter()
     scenario, spec = demo_scenario(effect, seed)
     make_folder(out)
-    _record(scenario, out / RECORDING)
+    _record(scenario, spec, out / RECORDING)
     with tempfile.TemporaryDirectory(prefix="twin-demo-") as folder, running_service(Path(folder)) as url:
         try:
             with TwinClient(url) as client:
@@ -109,12 +109,13 @@ def run_demo(effect: str, seed: int, out: Path) -> Iterator[Outcome]:
             raise ReplayError(str(error)) from error
 
 
-def _record(scenario: Scenario, path: Path) -> None:
+def _record(scenario: Scenario, spec: TwinSpec, path: Path) -> None:
     """Simulate the orbits and write what the sensors read."""
     with progress_bar("simulating orbits") as progress:
         record = simulate(scenario, progress).record
     units = {name: channel.unit for name, channel in scenario.channels.items()}
-    save_record(path, record, units, {"scenario": scenario.scenario})
+    declared = {"specification.json": to_json(dump_spec(spec)).encode()}
+    save_record(path, record, units, {"scenario": scenario.scenario}, declared)
 
 
 def _operate(

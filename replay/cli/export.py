@@ -1,34 +1,57 @@
 """``twin export``: a calibrated model for other tools."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from replay.cli.command import FILE, Command
 
+if TYPE_CHECKING:
+    from twin_core.calibrate import CalibratedModel
+
 
 @click.command(
     cls=Command,
     short_help="Take a calibrated model to other tools.",
-    example="twin export model.json --esatan satellite.d --out satellite.patch",
+    example="twin export model.json --fmu --out satellite.fmu",
 )
 @click.argument("model", type=FILE)
 @click.option("--out", required=True, type=FILE, help="File to write.")
+@click.option("--fmu", "as_fmu", is_flag=True, help="Write a functional mock-up unit (FMI 3.0) of generated C.")
 @click.option("--esatan", "deck", type=FILE, help="The deck that the model came from: writes a patch to it.")
 @click.option("--spec", "as_spec", is_flag=True, help="Write the specification with the calibrated values as known.")
-def export(model: Path, out: Path, deck: Path | None, as_spec: bool) -> None:
-    """Write a calibrated model as a patch to an ESATAN-TMS deck, or as a specification whose values are known.
+@click.option("--json", "as_data", is_flag=True, help="Write values, uncertainties and effects as plain JSON.")
+def export(model: Path, out: Path, as_fmu: bool, deck: Path | None, as_spec: bool, as_data: bool) -> None:
+    """Write a calibrated model as a functional mock-up unit, a patch to an ESATAN-TMS deck, a specification, or plain JSON.
 
-    A patch multiplies the expression of each coupling by what calibration made of it; apply it with patch -p0.
+    A unit runs in any tool that knows FMI 3.0, by Model Exchange or Co-Simulation. A patch multiplies the expression of
+    each coupling by what calibration made of it; apply it with patch -p0.
     """
-    from replay.cli.console import notify, print_line
+    from replay.cli.console import notify, print_line, to_json
     from replay.cli.models import load_model
+    from replay.cli.recordings import check_suffix
     from twin_core.errors import SpecError
     from twin_core.files import write_text
 
-    if (deck is None) == (not as_spec):
-        raise click.UsageError("give either --esatan DECK or --spec")
+    if sum([as_fmu, deck is not None, as_spec, as_data]) != 1:
+        raise click.UsageError("give one of --fmu, --esatan DECK, --spec and --json")
     found = load_model(model)
+    if as_fmu:
+        from twin_core.fmu import write_fmu
+
+        check_suffix(out, (".fmu",))
+        built = write_fmu(found, out)["platform"]
+        if built is None:
+            notify(
+                [f"{out}: no C compiler was found, so that it holds sources alone; the importing tool compiles them"]
+            )
+        print_line(f"wrote {out}: FMI 3.0, Model Exchange and Co-Simulation" + (f", {built}" if built else ""))
+        return
+    if as_data:
+        write_text(out, to_json(_plain(found)))
+        print_line(f"wrote {out}: {len(found.values)} values")
+        return
     if found.effects:
         names = ", ".join(effect.label for effect in found.effects)
         notify([f"{model}: what the loop added is not exported: {names}"])
@@ -54,6 +77,25 @@ def export(model: Path, out: Path, deck: Path | None, as_spec: bool) -> None:
     write_text(out, as_patch(text, after, deck.name))
     notify([f"{deck}: {name} stands in no statement of its own and is not in the patch" for name in left])
     print_line(f"wrote {out}: {len(changed)} couplings changed")
+
+
+def _plain(model: "CalibratedModel") -> dict[str, Any]:
+    """Return a model as data that needs nothing of this program to be read."""
+    from twin_core.effects import effect_to_json
+    from twin_core.network.calibrated import with_values
+
+    stds = {row["name"]: row.get("std") for row in model.summary.get("parameters", [])}
+    return {
+        "twin": model.spec.twin,
+        "train": model.summary.get("train"),
+        "specification": with_values(model.spec, model.values),
+        "parameters": [
+            {"name": p.name, "unit": p.unit, "value": model.values[p.name], "std": stds.get(p.name), "held": p.frozen}
+            for p in model.network().parameters.parameters
+        ],
+        "effects": [effect_to_json(effect) | {"equation": effect.equation} for effect in model.effects],
+        "noise_K": model.noise_K,
+    }
 
 
 def _known(spec: object, values: dict[str, float], out: Path) -> str:

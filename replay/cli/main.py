@@ -10,9 +10,11 @@ from collections.abc import Sequence
 import click
 
 from replay.cli.balance import balance
+from replay.cli.bridge import bridge
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
+from replay.cli.correlate import correlate
 from replay.cli.demo import demo
 from replay.cli.export import export
 from replay.cli.forecast import forecast
@@ -20,6 +22,7 @@ from replay.cli.import_model import import_model
 from replay.cli.keep import backup, migrate, migrate_store, restore
 from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
+from replay.cli.printing import print_page
 from replay.cli.record import record
 from replay.cli.register import register
 from replay.cli.serve import serve
@@ -46,9 +49,22 @@ def twin(traceback: bool) -> None:
 
 
 for command in (
-    *(init, check, balance, show, export),
-    *(demo, serve, register, simulate, replay, record, import_model, calibrate, forecast, close_loop, check_effect),
-    *(backup, restore, migrate, migrate_store, worker),
+    *(init, check, balance, show, print_page, export),
+    *(
+        demo,
+        serve,
+        register,
+        simulate,
+        replay,
+        record,
+        import_model,
+        calibrate,
+        correlate,
+        forecast,
+        close_loop,
+        check_effect,
+    ),
+    *(bridge, backup, restore, migrate, migrate_store, worker),
 ):
     twin.add_command(command)
 

@@ -56,7 +56,7 @@ def record(
 async def _record(
     url: str, twin: str, out: Path, start: str | None, duration_s: float | None, key: str | None
 ) -> "Tally":
-    from replay.cli.console import progress_bar
+    from replay.cli.console import progress_bar, to_json
     from replay.errors import ReplayError
     from replay.mcap_writer import McapWriter
     from replay.recorder import Recorder, topics_of
@@ -68,9 +68,10 @@ async def _record(
         except (ApiError, Unreachable) as error:
             raise ReplayError(f"twin '{twin}': {error}") from error
         topics, units = topics_of(head)
+        declared = {"specification.json": to_json(head.specification).encode()}
         with (
             progress_bar("recording") as progress,
-            McapWriter(out, topics, units, {"twin": twin}, keep=True) as writer,
+            McapWriter(out, topics, units, {"twin": twin}, attachments=declared, keep=True) as writer,
         ):
             recorder = Recorder(client, twin, writer, lambda tally: progress(0.0, f"{tally.samples} samples"))
             if start is not None:

@@ -148,8 +148,14 @@ def _form(record: Record) -> str:
     return "counts seconds" if record.epoch_ns is None else "is dated"
 
 
-def save_record(path: Path, record: Record, units: Mapping[str, str | None], metadata: Mapping[str, str]) -> None:
-    """Write a record in the units given, as CSV or MCAP; the file appears whole or not at all."""
+def save_record(
+    path: Path,
+    record: Record,
+    units: Mapping[str, str | None],
+    metadata: Mapping[str, str],
+    attachments: Mapping[str, bytes] | None = None,
+) -> None:
+    """Write a record in the units given, as CSV, or MCAP with attachments; the file appears whole or not at all."""
     check_suffix(path)
     if path.suffix == ".csv":
         write_columns(path, record, dict(units))
@@ -160,7 +166,7 @@ def save_record(path: Path, record: Record, units: Mapping[str, str | None], met
     columns = {name: from_si(values, units[name]) for name, values in record.values.items()}
     stated = {name: unit for name, unit in units.items() if unit is not None}
     dated = "false" if record.epoch_ns is None else "true"
-    write_mcap(path, time_ns, columns, stated, {**metadata, DATED: dated})
+    write_mcap(path, time_ns, columns, stated, {**metadata, DATED: dated}, attachments)
 
 
 def check_suffix(path: Path, suffixes: Sequence[str] = SUFFIXES) -> None:

@@ -27,7 +27,9 @@ def simulate(scenario: Path, out: Path, as_json: bool) -> None:
     with progress_bar("simulating") as progress:
         record = run(plan, progress).record
     units = {name: channel.unit for name, channel in plan.channels.items()}
-    save_record(out, record, units, {"scenario": plan.scenario, "seed": str(plan.seed)})
+    save_record(
+        out, record, units, {"scenario": plan.scenario, "seed": str(plan.seed)}, {scenario.name: scenario.read_bytes()}
+    )
     outcome = {"out": str(out), "samples": int(record.time_s.size), "channels": list(record.values)}
     print_line(
         to_json(outcome).rstrip()

@@ -36,16 +36,22 @@ def test_round_trip_keeps_every_bit(tmp_path: Path) -> None:
 
 def test_reference_library_sees_one_json_topic_per_channel(tmp_path: Path) -> None:
     time_ns, values = columns()
-    write_mcap(tmp_path / "a.mcap", time_ns, values, {"T_px": "K"}, {})
+    declared = b'{"twin": "benchsat"}'
+    write_mcap(tmp_path / "a.mcap", time_ns, values, {"T_px": "K"}, {}, {"specification.json": declared})
     with (tmp_path / "a.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
+        (attached,) = reader.iter_attachments()
         messages = list(reader.iter_messages())
     assert summary is not None
     assert sorted(channel.topic for channel in summary.channels.values()) == ["Q_px", "T_px"]
     assert {channel.message_encoding for channel in summary.channels.values()} == {"json"}
     assert {schema.encoding for schema in summary.schemas.values()} == {"jsonschema"}
+    assert (attached.name, attached.media_type, attached.data) == ("specification.json", "application/json", declared)
+    names = [schema.name for schema in summary.schemas.values()]
+    assert len(set(names)) == len(names) == 2
     first_schema, first_channel, first = messages[0]
+    assert json.loads(first_schema.data)["properties"]["value"]["unit"] == "K"
     assert json.loads(first_schema.data)["properties"]["value"]["type"] == "number"
     assert (first_channel.topic, first.log_time, json.loads(first.data)) == ("T_px", START_NS, {"value": 290.0})
     assert len(messages) == 6  # four finite temperatures, two powers; missing samples write nothing

@@ -35,6 +35,20 @@ def whiteness(residual: FloatArray) -> float | None:
     return float(np.mean((before[valid] - centre) * (after[valid] - centre))) / power if power > 0 else None
 
 
+def spread_of(deviation_K: FloatArray) -> dict[str, float]:
+    """Return how finite deviations (measured minus modelled) spread: mean, standard deviation, largest, quantiles, in K."""
+    q01, q50, q99 = np.quantile(deviation_K, (0.01, 0.5, 0.99))
+    return {
+        "bias_K": float(deviation_K.mean()),
+        "std_K": float(deviation_K.std()),
+        "max_abs_K": float(np.abs(deviation_K).max()),
+        "q01_K": float(q01),
+        "q50_K": float(q50),
+        "q99_K": float(q99),
+        "q99_abs_K": float(np.quantile(np.abs(deviation_K), 0.99)),
+    }
+
+
 def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Sequence[FloatArray]) -> dict[str, Any]:
     """Return overall and per-sensor errors of one or several segments.
 
@@ -48,7 +62,7 @@ def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Seq
     Returns
     -------
     dict
-        ``rmse_K``, ``pcc`` and ``per_sensor`` with ``rmse_K``, ``pcc``, ``bias_K``, ``std_K``, ``q99_abs_K`` each.
+        ``rmse_K``, ``pcc`` and ``per_sensor`` with ``rmse_K``, ``pcc`` and the figures of :func:`spread_of` each.
     """
     all_measured = np.concatenate(list(measured))
     all_predicted = np.concatenate(list(predicted))
@@ -60,9 +74,7 @@ def score(sensors: Sequence[str], measured: Sequence[FloatArray], predicted: Seq
             per_sensor[sensor] = {
                 "rmse_K": rmse(finite),
                 "pcc": pearson(all_measured[:, i], all_predicted[:, i]),
-                "bias_K": float(finite.mean()),
-                "std_K": float(finite.std()),
-                "q99_abs_K": float(np.quantile(np.abs(finite), 0.99)),
+                **spread_of(finite),
             }
     pooled = pearson(all_measured.ravel(), all_predicted.ravel())
     each = [row["pcc"] for row in per_sensor.values() if row["pcc"] is not None]

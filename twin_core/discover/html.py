@@ -12,13 +12,16 @@ import numpy as np
 from twin_core import __version__
 from twin_core._typing import FloatArray, Json
 from twin_core.discover import phrasing
-from twin_core.discover.network_picture import draw_network
+from twin_core.discover.network_picture import draw_flows, draw_network
+from twin_core.discover.residual_picture import draw_residuals
+from twin_core.units import format_instant
 
 if TYPE_CHECKING:
     from jinja2 import Template
 
 _FOLDER = Path(__file__).parent / "templates"
 _BINS = 40
+_MOST_FLOWS = 60
 
 
 def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
@@ -44,10 +47,18 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         gain=phrasing.gain(_rmse(report, "before"), _rmse(report, "after")),
         fell=_fell(report),
         sensors=_sensors(report),
+        ensemble=report.get("ensemble") or {},
+        parameters=[row for row in _parameters(report) if row["said"] != "known"],
+        known=[row for row in _parameters(report) if row["said"] == "known"],
+        sensitivity=_sensitivity(report),
+        residuals=_residuals(plots),
+        flows=_flows(report),
+        document=report.get("document") or {},
+        provenance=report.get("provenance") or {},
         evidence=_evidence(report),
         picture=draw_network(plots.get("network") or {}),
         quality_strip=plots.get("quality_strip") or "",
-        criteria=plots.get("criteria") or report.get("criteria") or {},
+        criteria=plots.get("criteria") or {},
         data=_for_script(_chart_data(plots)),
         **{name: _asset(name) for name in ("style", "script", "uplot_style", "uplot_script")},
     )
@@ -104,6 +115,101 @@ def _sensors(report: Mapping[str, Any]) -> list[Json]:
     return [{"name": name, "before": before.get(name) or {}, "after": after.get(name) or {}} for name in names]
 
 
+def _parameters(report: Mapping[str, Any]) -> list[Json]:
+    """Return the rows of the table of parameters, in words."""
+    rows = []
+    for row in report.get("parameters") or []:
+        corrected = row.get("corrected") or {}
+        if corrected.get("std") is None and row.get("identified") is None:
+            said, kind = "known", ""
+        else:
+            said, kind = ("identified", "met") if row.get("identified") else ("not identified", "missed")
+        texts = {
+            k: phrasing.with_spread(v.get("mean"), v.get("std"))
+            for k in ("calibrated", "corrected")
+            if (v := row.get(k))
+        }
+        declared = phrasing.number(row.get("declared"), 4)
+        rows.append(
+            {
+                "name": row["name"],
+                "unit": phrasing.unit(row.get("unit") or ""),
+                "declared": declared,
+                "said": said,
+                "kind": kind,
+            }
+            | texts
+        )
+    return rows
+
+
+def _sensitivity(report: Mapping[str, Any]) -> Json:
+    """Return the sensitivity matrix with each cell's share of the largest of its sensor, in per cent of full colour."""
+    matrix = report.get("sensitivity") or {}
+    if not matrix.get("rows"):
+        return {}
+    largest = np.max([row["rms_K"] for row in matrix["rows"]], axis=0)
+    return {
+        "sensors": matrix["sensors"],
+        "rows": [
+            row
+            | {
+                "cells": [
+                    {"value": value, "share": round(60.0 * value / most) if most > 0 else 0}
+                    for value, most in zip(row["rms_K"], largest.tolist(), strict=True)
+                ]
+            }
+            for row in matrix["rows"]
+        ],
+    }
+
+
+def _residuals(plots: Mapping[str, Any]) -> list[Json]:
+    """Return the picture of each sensor's residuals over the hold-out."""
+    time, start = plots.get("time") or [], plots.get("holdout_start")
+    if not time or start is None or not math.isfinite(start):
+        return []
+    shown = [t >= start for t in time]
+    kept = [t for t, show in zip(time, shown, strict=True) if show]
+    ends = tuple(_told(t, bool(plots.get("dated"))) for t in (kept[0], kept[-1])) if kept else ("", "")
+    rows = []
+    for name, series in (plots.get("sensors") or {}).items():
+        limits = (plots.get("limits") or {}).get(name) or {}
+        histogram = (plots.get("histograms") or {}).get(name) or {}
+        picture = draw_residuals(series, shown, histogram, limits, (ends[0], ends[1]))
+        if picture:
+            rows.append({"name": name, "noise_K": limits.get("noise_K"), "picture": picture})
+    return rows
+
+
+def _told(time_s: float, dated: bool) -> str:
+    return f"{format_instant(round(time_s) * 10**9)}" if dated else f"{time_s:g} s"
+
+
+def _flows(report: Mapping[str, Any]) -> list[Json]:
+    """Return each phase of the heat-flow map with its picture, and its flows from the largest down."""
+    found = []
+    for phase in report.get("heat_flows") or []:
+        rows = [_flow(link["kind"], link["ends"][0], link["ends"][1], link["heat_W"]) for link in phase["links"]]
+        rows += [_flow("load", load["channel"], load["node"], load["heat_W"]) for load in phase["loads"]]
+        rows += [_flow("heater", "heater", heater["node"], heater["heat_W"]) for heater in phase["heaters"]]
+        for effect in phase["effects"]:
+            name = phrasing.in_words(effect["effect"])
+            rows += [_flow("found", name, node, heat) for node, heat in effect["heat_W"].items()]
+        rows.sort(key=lambda row: -row["heat_W"])
+        hidden = max(len(rows) - _MOST_FLOWS, 0) + phase.get("links_left_out", 0)
+        told = {key: phase[key] for key in ("phase", "start", "stop")}
+        found.append(told | {"rows": rows[:_MOST_FLOWS], "hidden": hidden, "picture": draw_flows(phase)})
+    return found
+
+
+def _flow(kind: str, source: str, target: str, heat_W: float) -> Json:
+    """Return one flow in the direction in which its heat goes."""
+    if heat_W < 0.0:
+        source, target = target, source
+    return {"kind": kind, "source": source, "target": target, "heat_W": abs(heat_W)}
+
+
 def _evidence(report: Mapping[str, Any]) -> list[Json]:
     """Return the rows of the evidence table: findings, each followed by its alternatives, then what was refused."""
     rows = []
@@ -128,35 +234,50 @@ def _figures(evidence: Mapping[str, Any]) -> Json:
 
 def _chart_data(plots: Mapping[str, Any]) -> Json:
     """Return what the page's script draws."""
-    heat = [{**item, "by_temperature": _by_temperature(item)} for item in plots.get("missing_heat") or []]
+    # What flows through a coupling that was found is no function of the temperature of one of its ends.
+    coupled = {end for item in plots.get("driven_heat") or [] for end in (item["node"], item["other"])}
+    heat = [
+        {**item, "by_temperature": None if item["node"] in coupled else _by_temperature(item)}
+        for item in plots.get("missing_heat") or []
+    ]
+    driven = [
+        {"node": item["node"], "unit": item["unit"], "axis": item["axis"]}
+        | {"over": _binned(*(_floats(item, key) for key in ("x", "heat_W", "std_W", "effect_W")))}
+        for item in plots.get("driven_heat") or []
+    ]
     return {
         "dated": bool(plots.get("dated")),
         "time": plots.get("time") or [],
         "holdout_start": plots.get("holdout_start"),
         "sensors": plots.get("sensors") or {},
         "missing_heat": heat,
+        "driven_heat": driven,
     }
 
 
 def _by_temperature(item: Mapping[str, Any]) -> Json:
-    """Return missing heat over temperature: sorted points, and the mean with its band in bins of equal counts."""
-    temperature_K, heat_W, std_W = (_floats(item, key) for key in ("temperature_K", "mean_W", "std_W"))
-    effect_W = _floats(item, "effect_W") if item.get("effect_W") else np.full(heat_W.shape, np.nan)
-    order = np.argsort(temperature_K, kind="stable")
-    order = order[np.isfinite(temperature_K[order]) & np.isfinite(heat_W[order])]
-    bins = [part for part in np.array_split(order, min(_BINS, max(order.size // 4, 1))) if part.size]
-    centre = [float(temperature_K[part].mean()) for part in bins]
-    mean = [float(heat_W[part].mean()) for part in bins]
-    # Inside a bin neighbouring samples share one smooth error, so the band does not shrink with their number.
-    spread = [float(np.sqrt(np.mean(std_W[part] ** 2))) for part in bins]
-    effect = [float(effect_W[part].mean()) for part in bins]
+    """Return missing heat over temperature; the regression's own curve, where there is one, instead of means."""
+    names = ("temperature_K", "mean_W", "std_W", "effect_W")
+    found = _binned(*(_floats(item, key) for key in names))
     if law := item.get("law"):
-        # The regression's own curve, where there is one; the effect's heat moves onto its temperatures.
-        at, mean, spread = (list(_floats(law, key)) for key in ("temperature_K", "mean_W", "std_W"))
-        effect, centre = list(np.interp(at, centre, effect)), at
+        centre, _, _, effect = found["bins"]
+        at, mean, spread = (_floats(law, key) for key in ("temperature_K", "mean_W", "std_W"))
+        moved = np.interp(at, centre, np.array([np.nan if e is None else e for e in effect]))
+        found["bins"] = [_nullable(column) for column in (at, mean, spread, moved)]
+    return found
+
+
+def _binned(x: FloatArray, heat_W: FloatArray, std_W: FloatArray, effect_W: FloatArray) -> Json:
+    """Return heat over what drives it: sorted points, and the means with their bands in bins of equal counts."""
+    order = np.argsort(x, kind="stable")
+    order = order[np.isfinite(x[order]) & np.isfinite(heat_W[order])]
+    bins = [part for part in np.array_split(order, min(_BINS, max(order.size // 4, 1))) if part.size]
+    # Inside a bin neighbouring samples share one smooth error, so the band does not shrink with their number.
+    spread = np.array([np.sqrt(np.mean(std_W[part] ** 2)) for part in bins])
+    centre, mean, effect = (np.array([column[part].mean() for part in bins]) for column in (x, heat_W, effect_W))
     return {
-        "points": [_nullable(temperature_K[order]), _nullable(heat_W[order])],
-        "bins": [_nullable(np.array(column)) for column in (centre, mean, spread, effect)],
+        "points": [_nullable(x[order]), _nullable(heat_W[order])],
+        "bins": [_nullable(column) for column in (centre, mean, spread, effect)],
     }
 
 

@@ -16,6 +16,8 @@ _LONGEST = 24
 _EFFECT_BEND = -26.0
 _STEPS = 400
 _STRETCH = 1.6
+_MOST_PLACES = 40
+"""Nodes and boundaries beyond which arrows would only cover one another."""
 
 
 def draw_network(network: Mapping[str, Any]) -> str:
@@ -45,6 +47,69 @@ def draw_network(network: Mapping[str, Any]) -> str:
     parts += [_effect_label(at, effect) for effect in effects]
     label = f"Thermal network of {len(nodes)} nodes"
     return f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def draw_flows(flows: Mapping[str, Any]) -> str:
+    """Return the heat flows of one moment or phase as an ``<svg>`` element: arrows in watts, temperatures, and loads.
+
+    Parameters
+    ----------
+    flows
+        As ``twin_core.flows.heat_flows`` returns them.
+
+    Returns
+    -------
+    str
+        Empty where there are more nodes than a picture holds.
+    """
+    temperatures = {row["id"]: row["temperature_K"] for row in (*flows["nodes"], *flows["boundaries"])}
+    if not 0 < len(temperatures) <= _MOST_PLACES:
+        return ""
+    ends = [(*link["ends"], link["heat_W"]) for link in flows["links"] if all(e in temperatures for e in link["ends"])]
+    heat: dict[str, float] = {}
+    for entry in (*flows["loads"], *flows["heaters"]):
+        heat[entry["node"]] = heat.get(entry["node"], 0.0) + entry["heat_W"]
+    for effect in flows["effects"]:
+        where, into = effect["where"], effect["heat_W"]
+        pair = _ends(effect)
+        if pair is not None and pair[0] in into:
+            ends.append((pair[1], pair[0], into[pair[0]]))
+        elif "node" in where:
+            heat[where["node"]] = heat.get(where["node"], 0.0) + into.get(where["node"], 0.0)
+    joined: dict[tuple[str, str], float] = {}
+    for a, b, W in ends:  # conductor and radiation between the same two are one arrow
+        key = (b, a) if (b, a) in joined else (a, b)
+        joined[key] = joined.get(key, 0.0) + (W if key == (a, b) else -W)
+    at = _positions(list(temperatures), list(joined))
+    most = max((abs(W) for W in joined.values()), default=0.0) or 1.0
+    parts = [_arrow(at, *(pair if W >= 0.0 else pair[::-1]), abs(W), most) for pair, W in joined.items()]
+    boundaries = {row["id"] for row in flows["boundaries"]}
+    for name, temperature_K in temperatures.items():
+        parts.append(_box(at, name) if name in boundaries else _disc(at, name))
+        said = f"{number(temperature_K, 4)} K" + (f", loads {number(heat[name])} W" if name in heat else "")
+        parts.append(_text(at[name], said, "below", 33.0))
+    label = f"Heat flows between {len(temperatures)} nodes and boundaries"
+    return f'<svg viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
+
+
+def _arrow(at: Mapping[str, tuple[float, float]], source: str, target: str, heat_W: float, most_W: float) -> str:
+    """Return a line as wide as its heat, with a head at its middle that points to where the heat goes, and the watts."""
+    (x0, y0), (x1, y1) = at[source], at[target]
+    width = 1.0 + 7.0 * heat_W / most_W
+    length = math.hypot(x1 - x0, y1 - y0) or 1.0
+    along, size = ((x1 - x0) / length, (y1 - y0) / length), 5.0 + width
+    tip = (x0 + 0.56 * (x1 - x0), y0 + 0.56 * (y1 - y0))
+    back = (tip[0] - 1.6 * size * along[0], tip[1] - 1.6 * size * along[1])
+    side = (-along[1] * size, along[0] * size)
+    head = f"{tip[0]:.1f},{tip[1]:.1f} {back[0] + side[0]:.1f},{back[1] + side[1]:.1f}"
+    line = f'<path class="flow" d="M{x0:.1f} {y0:.1f}L{x1:.1f} {y1:.1f}" style="stroke-width:{width:.1f}"/>'
+    aside = 1.0 if along[0] >= 0.0 else -1.0  # above the line, or to the right of a steep one
+    beside = (
+        x0 + 0.4 * (x1 - x0) + aside * 2.2 * size * along[1],
+        y0 + 0.4 * (y1 - y0) - aside * 1.2 * size * along[0],
+    )
+    polygon = f'<polygon class="arrow" points="{head} {back[0] - side[0]:.1f},{back[1] - side[1]:.1f}"/>'
+    return line + polygon + _text(beside, f"{number(heat_W)} W", "flow-label", 3.0)
 
 
 def _ends(effect: Mapping[str, Any]) -> tuple[str, str] | None:

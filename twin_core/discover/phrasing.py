@@ -1,7 +1,7 @@
 """The verdict in words and numbers with units, for people."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from twin_core._typing import Json
@@ -28,6 +28,8 @@ def headline(report: Mapping[str, Any]) -> str:
     """Return the verdict as one sentence."""
     findings = report.get("findings") or []
     verdict = report.get("verdict")
+    if verdict == "correlated":
+        return _correlated(report.get("phases") or [])
     if verdict == "effect_added" and findings:
         more = len(findings) - 1
         others = f"; {more} more effect{'s were' if more > 1 else ' was'} found" if more else ""
@@ -39,6 +41,18 @@ def headline(report: Mapping[str, Any]) -> str:
     if verdict == "unexplained":
         return "Something is missing from the model, and no known effect explains it."
     return "The declared model suffices: the data supports no missing effect."
+
+
+def _correlated(phases: Sequence[Mapping[str, Any]]) -> str:
+    """Return in which phases a correlated model meets the criteria."""
+    missed = []
+    for phase in phases:
+        rows = (phase.get("after") or {}).get("per_sensor") or {}
+        if sensors := [name for name, row in rows.items() if not row.get("met")]:
+            missed.append(f"{phase['phase']} ({', '.join(sensors[:3])}{', ...' if len(sensors) > 3 else ''})")
+    if not missed:
+        return f"The correlated model meets the criteria in {'every phase' if len(phases) > 1 else 'its phase'}."
+    return f"The correlated model does not meet the criteria in {' and '.join(missed)}."
 
 
 def sentence(finding: Mapping[str, Any], *, capital: bool = False) -> str:
@@ -121,6 +135,11 @@ def number(value: Any, digits: int = 3) -> str:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa}·10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
     return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
+
+
+def unit(plain: str) -> str:
+    """Return a unit as it is printed: ``m²`` for ``m2``."""
+    return plain.replace("m2", "m²").replace("^2", "²")
 
 
 def with_spread(mean: Any, std: Any) -> str:

@@ -7,6 +7,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.result import CalibratedModel
+from twin_core.discover.dossier import histograms, limits
+from twin_core.discover.driven import thinned
 from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.judge import Search
 from twin_core.discover.witness import NodeHeat, Witness
@@ -39,6 +41,7 @@ def build_plots(
     predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
     report: Json,
     witness: Witness,
+    driven: Sequence[Json],
 ) -> Json:
     """Return everything that the page of a report draws.
 
@@ -50,16 +53,22 @@ def build_plots(
         The finished report, for its criteria and words.
     witness
         The heat that the declared model lacks.
+    driven
+        The heat of couplings over what drives it, as ``driven.driven_heat``.
     """
     first = search.base.fit.nominals[-1].segment.record
     return {
         "dated": first.epoch_ns is not None,
         **_temperatures(search, held, predictions),
         "missing_heat": [_missing_heat(heat, first) for heat in witness.heats],
+        "driven_heat": thinned(driven, MAX_POINTS),
+        "histograms": histograms(before.spec, predictions),
+        "limits": limits(before.spec, before.noise_K),
         "network": _network(after),
         "criteria": {
             "bias_K": before.spec.criteria.bias_K,
             "q99_abs_K": before.spec.criteria.q99_abs_K,
+            "std_K": before.spec.criteria.std_K,
             "before": report["criteria"]["before"],
             "after": report["criteria"]["after"],
         },

@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 
 from twin_core._typing import Json
+from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.identifiability import strong_correlations
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, acceptance, stated_guesses, with_met
 from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.discover.dossier import ensemble, heat_flow_maps, left_out, sensitivity
 from twin_core.discover.experiments import separating
 from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.judge import Finding, Judged, Search
@@ -139,6 +142,14 @@ def _left_out(search: Search) -> list[str]:
     return [f"the deadline ended the search: this is the best answer so far; not looked at: {some}{more}"]
 
 
+def _thinned(search: Search) -> list[str]:
+    """Return what of a long record the search looked at, in words."""
+    if search.every == 1:
+        return []
+    share = f"one of {search.every} samples"
+    return [f"the record is long: effects were searched on {share}; both models were calibrated on all of them"]
+
+
 def unexplained_share(calibration: Calibration) -> float:
     """Return the part of the open-loop residuals' variance over the training part that is beyond the sensors' noise."""
     scaled = np.concatenate(calibration.residuals) / calibration.problem.noise_K
@@ -193,6 +204,7 @@ def build_report(
     train = [segment.record for segment in search.base.fit.problem.segments]
     residuals = [[p.measured_K - p.predicted_K for p in ps] for ps in predictions]
     scored = [h.scored for h in held]
+    failures = search.failures
     counted = int(sum(np.isfinite(p.measured_K).any(axis=1).sum() for p in predictions[0]))
     return {
         "twin": before.spec.twin,
@@ -211,6 +223,10 @@ def build_report(
             "before": acceptance(before.spec, scores[0]["per_sensor"]),
             "after": acceptance(after.spec, scores[1]["per_sensor"]),
         },
+        "ensemble": {
+            when: ensemble(before.spec, row_of["per_sensor"], p)
+            for when, row_of, p in zip(("before", "after"), scores, predictions, strict=True)
+        },
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
         "not_supported": [
             {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged), "reason": judged.reason}
@@ -221,12 +237,23 @@ def build_report(
             "after": unexplained_share(search.trial.calibration()),
         },
         "parameters": parameter_rows(search, before, after),
+        "correlations": strong_correlations(after.network().parameters, after.covariance, 0.5, 15)
+        if after.free_names
+        else [],
+        "sensitivity": attempted(lambda: sensitivity(search.trial.calibration()), "sensitivity matrix", failures) or {},
+        "heat_flows": attempted(lambda: heat_flow_maps(search, after), "heat flows", failures) or [],
+        "excluded": left_out(before.spec),
         "failures": list(dict.fromkeys(search.failures)),
-        "search": {"complete": not search.left_out, "left_out": len(search.left_out)},
+        "search": {
+            "complete": not search.left_out,
+            "left_out": len(search.left_out),
+            "every": search.every,
+        },
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
             *_left_out(search),
+            *_thinned(search),
             *before.summary["notices"],
             *(notice for p in predictions[1] for notice in p.notices),
         ],

@@ -100,11 +100,11 @@ class NodeHeat:
         return alike or (self.correlation or 0.0) >= CORRELATED
 
     def _following(self) -> str:
-        """Return what the swings come back with, in words."""
+        """Return what the swings follow, as a sentence."""
         what, share = next(iter(self.follows.items()), ("nothing", 0.0))
         if share < REPEATABLE:
-            return f"which comes back with nothing declared (at best {share:.0%} of it with the {what})"
-        return f"of which {share:.0%} comes back with the {what}"
+            return f"that variation follows nothing that is declared (at best {share:.0%} of it the {what})"
+        return f"{share:.0%} of that variation follows the {what}"
 
     def row(self) -> Json:
         """Return the figures for a report."""
@@ -123,22 +123,24 @@ class NodeHeat:
         }
 
     def words(self) -> str:
-        """Return one sentence."""
+        """Return what it says in a few sentences."""
+        mean, swing = self.mean_W.mean(), self.mean_W.std()
+        lacks = f"lacks {mean:.3g} W at {self.node}" if mean >= 0.0 else f"has {-mean:.3g} W too much at {self.node}"
         seen = (
-            f"Latent force at {self.node}: the declared model lacks {self.mean_W.mean():.3g} W on average, "
-            f"swinging by {self.mean_W.std():.2g} W (band {self.band_W:.2g} W), {self._following()}"
+            f"The declared model {lacks} on average; this varies by {swing:.2g} W (uncertainty {self.band_W:.2g} W), and "
+            f"{self._following()}."
         )
         if self.effect_W is None:
-            return f"{seen}."
-        said = f"the added effects supply {self.effect_W.mean():.3g} W"
-        if self.correlation is not None:
-            said += f", correlation {self.correlation:.2f}"
+            return seen
+        supplied = self.effect_W.mean()
         verdict = {
             True: "the two agree",
             False: "the two differ, as they do where declared parameters had taken up a part of that heat",
-            None: "the band is too wide to compare them",
+            None: "the uncertainty is too wide to compare them",
         }[self.agrees]
-        return f"{seen}; {said}: {verdict}."
+        said = f"supply {supplied:.3g} W" if supplied >= 0.0 else f"take {-supplied:.3g} W away"
+        alike = "" if self.correlation is None else f" (correlation {self.correlation:.2f})"
+        return f"{seen} The findings {said} there: {verdict}{alike}."
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,7 @@ def bear_witness(search: Search, *, deadline: float = NO_DEADLINE) -> Witness:
     try:
         with limited(deadline):
             check_time()
-            force, model, observations, values, view = _smoothed(search.base.fit, nodes)
+            force, model, observations, values, view = smoothed_force(search.base.fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
         return Witness((), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",))
     watched = [force.nodes.index(search.base.fit.network.nodes.index(node)) for node in nodes]
@@ -210,14 +212,14 @@ def told_by(witness: Witness, report: Json) -> Json:
 
 
 @dataclass(frozen=True)
-class _View:
+class View:
     """The steps of a segment that are smoothed: ``forcing`` begins at its step ``first_step``."""
 
     forcing: Forcing
     first_step: int
 
     @classmethod
-    def of(cls, forcing: Forcing, n_states: int) -> "_View":
+    def of(cls, forcing: Forcing, n_states: int) -> "View":
         """Return the end of a forcing that is not too much work."""
         first = max(0, forcing.n_steps - max(int(MAX_WORK / n_states**2), 2))
         at = forcing.sample_step
@@ -252,10 +254,12 @@ class _View:
         return total
 
 
-def _smoothed(fit: HeatFit, nodes: Sequence[str]) -> tuple[LatentForce, ForceModel, FloatArray, FloatArray, _View]:
+def smoothed_force(
+    fit: HeatFit, nodes: Sequence[str]
+) -> tuple[LatentForce, ForceModel, FloatArray, FloatArray, "View"]:
     """Return the smoothed forces, their model about the smoothed temperatures, readings, hyperparameters and steps."""
     nominal, network = fit.nominals[-1], fit.network
-    view = _View.of(nominal.segment.forcing, 2 * len(network.nodes))
+    view = View.of(nominal.segment.forcing, 2 * len(network.nodes))
     states = np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])[view.first_step :]
     turnover = view.turnover_W(network, states[1:])
     watched = [network.nodes.index(node) for node in nodes]
@@ -277,7 +281,7 @@ def _smoothed(fit: HeatFit, nodes: Sequence[str]) -> tuple[LatentForce, ForceMod
     return force, replace(model, network=lambda _: final), observations, values, view
 
 
-def _model(fit: HeatFit, nominal: Nominal, view: _View, at: Sequence[int], states_K: FloatArray) -> ForceModel:
+def _model(fit: HeatFit, nominal: Nominal, view: View, at: Sequence[int], states_K: FloatArray) -> ForceModel:
     """Return the declared network with a Matérn-1/2 force (the paper's) on some nodes."""
     network, segment = fit.network, nominal.segment
     return declared_model(

@@ -231,6 +231,9 @@ class Effect(ABC):
     """Settings that the report lists beside the parameters where the effect has them, such as knots."""
     plugin: ClassVar[str] = ""
     """The file or the package that it comes from, where it is none of the effects that are always there."""
+    driven_by: ClassVar[str] = ""
+    """What its heat is a function of where that is no single temperature: ``difference`` of the temperatures of its two ends, or
+    ``radiation``, the difference of what black bodies at these temperatures emit."""
     fallback: ClassVar[bool] = False
     """True for an effect that is tried only where no named one is supported."""
 

@@ -16,6 +16,7 @@ class LeakToBoundary(Effect):
     equation = "q = G (T_s - T)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
     sentence = "a heat leak from {node} to {boundary} was missing"
+    driven_by = "difference"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the conductance."""

@@ -44,6 +44,7 @@ class MissingConductor(Effect):
     equation = "q_a = -q_b = G (T_b - T_a)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
     sentence = "a conductor between {first} and {second} was missing"
+    driven_by = "difference"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the conductance."""

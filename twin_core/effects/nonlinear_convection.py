@@ -53,6 +53,7 @@ class NonlinearConvection(Effect):
     equation = "q = k sgn(d) |d|^p, d = T_s - T"
     reference = "Incropera et al., Fundamentals of Heat and Mass Transfer, 7th ed., ch. 9"
     sentence = "convection from {node} to {boundary} was missing"
+    driven_by = "difference"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return coefficient and exponent."""

@@ -16,6 +16,7 @@ class RadiationToSink(Effect):
     equation = "q = sigma R (T_s^4 - T^4)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2"
     sentence = "a radiator from {node} to {sink} was missing"
+    driven_by = "radiation"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the exchange area R = emissivity * area * view factor."""

@@ -47,6 +47,7 @@ class RadiativeExchange(Effect):
     equation = "q_a = -q_b = sigma R (T_b^4 - T_a^4)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 15"
     sentence = "a radiative coupling between {first} and {second} was missing"
+    driven_by = "radiation"
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the exchange area."""

@@ -505,6 +505,11 @@ class TwinSpec(Strict):
         for i, heater in enumerate(self.heaters):
             yield from self._check_end(f"heaters[{i}].node", heater.node, nodes)
             yield from self._check_end(f"heaters[{i}].control", heater.controlled_by, nodes)
+            if heater.thermostat is not None and heater.controlled_by != heater.node:
+                yield (
+                    f"heaters[{i}].control: a thermostat is switched by the node that it heats; leave 'control' out, or use"
+                    " 'proportional', which may read another node"
+                )
             if heater.name in names[:i]:
                 yield f"heaters[{i}]: node '{heater.node}' has another heater with the same control; add the powers"
 

@@ -9,11 +9,16 @@ from twin_core.telemetry import Record
 COLOURS = {"frozen": "#4f7cac", "rail": "#8e6c8a", "sentinel": "#c0504d", "spike": "#e0a030"}
 """Of each reason, in the strip."""
 
+MOST_SPANS = 20
+"""Of one channel and reason that are listed one by one."""
+
 _WIDTH, _ROW, _LABEL = 900.0, 18.0, 190.0
 
 
 def quality_json(records: Sequence[Record]) -> list[Json]:
     """Return samples and spans that were masked, per channel and reason, in the order of their first appearance.
+
+    ``first`` lists the first spans of each with ``start`` and ``stop``, their first and last sample.
 
     Parameters
     ----------
@@ -23,10 +28,13 @@ def quality_json(records: Sequence[Record]) -> list[Json]:
     counted: dict[tuple[str, str], Json] = {}
     for record in records:
         for flaw in record.flaws or ():
-            row = {"channel": flaw.channel, "reason": flaw.reason, "samples": 0, "spans": 0}
+            row = {"channel": flaw.channel, "reason": flaw.reason, "samples": 0, "spans": 0, "first": []}
             entry = counted.setdefault((flaw.channel, flaw.reason), row)
             entry["samples"] += flaw.samples
             entry["spans"] += 1
+            if len(entry["first"]) < MOST_SPANS:
+                start, stop = record.present(flaw.start_s), record.present(flaw.stop_s)
+                entry["first"].append({"start": start, "stop": stop, "samples": flaw.samples})
     return list(counted.values())
 
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +59,29 @@ def test_every_value_is_known_afterwards(tmp_path: Path) -> None:
             if name != "C:skin":  # stores nothing: what stands for that follows from its couplings
                 assert known.as_dict()[name] == pytest.approx(value), name
     assert with_values(model.spec, model.values)["parameters"]["joints"] == {"value": pytest.approx(1.32)}
+
+
+def test_a_unit_and_plain_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    radiator = {
+        "twin": "plate",
+        "boundaries": {"space": {"value_K": 3.0}},
+        "channels": {"T": {"kind": "temperature", "unit": "K"}},
+        "nodes": [{"id": "a", "sensor": "T", "capacity_J_per_K": {"guess": 900.0}}],
+        "radiators": [{"node": "a", "emissivity": 0.8, "area_m2": 0.1, "sink": "space"}],
+    }
+    (tmp_path / "model.json").write_text(json.dumps(model_of(radiator, **{"C:a": 800.0}).to_json()))
+    unit, plain = tmp_path / "plate.fmu", tmp_path / "plate.json"
+    assert main(["export", str(tmp_path / "model.json"), "--fmu", "--out", str(unit)]) == 0
+    with zipfile.ZipFile(unit) as archive:
+        assert {"modelDescription.xml", "sources/network.c", "sources/buildDescription.xml"} <= set(archive.namelist())
+    assert main(["export", str(tmp_path / "model.json"), "--json", "--out", str(plain)]) == 0
+    told = json.loads(plain.read_text())
+    assert told["specification"]["nodes"][0]["capacity_J_per_K"] == {"value": 800.0}
+    assert {"name": "C:a", "unit": "J/K", "value": 800.0, "std": None, "held": False} in told["parameters"]
+    heaters = [{"node": "a", "thermostat": {"on_K": 280.0, "off_K": 282.0, "power_W": {"value": 5.0}}}]
+    (tmp_path / "model.json").write_text(json.dumps(model_of(radiator | {"heaters": heaters}).to_json()))
+    assert main(["export", str(tmp_path / "model.json"), "--fmu", "--out", str(unit)]) == 2
+    assert "thermostat" in capsys.readouterr().err
 
 
 def test_one_of_both(tmp_path: Path) -> None:

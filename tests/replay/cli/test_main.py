@@ -23,6 +23,7 @@ def test_the_commands() -> None:
             "check",
             "check-effect",
             "close-loop",
+            "correlate",
             "demo",
             "export",
             "forecast",
@@ -31,7 +32,7 @@ def test_the_commands() -> None:
             "migrate",
             "migrate-store",
         ),
-        *("record", "register", "replay", "restore", "serve", "show", "simulate", "worker"),
+        *("print", "record", "register", "replay", "restore", "serve", "show", "simulate", "worker"),
     ]
 
 

@@ -149,7 +149,7 @@ def test_what_is_no_reading_is_masked_told_and_drawn(
         ("T_b", "sentinel", 1, 1),
     ]
     page = (out / "report.html").read_text()
-    assert "Telemetry that is no reading" in page and page.count("<title>T_a: 2 spike") == 1
+    assert "Telemetry that was left out" in page and page.count("<title>T_a: 2 spike") == 1
 
 
 def test_without_masking_every_sample_counts(

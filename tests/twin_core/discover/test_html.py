@@ -207,3 +207,14 @@ def test_charts_are_drawn_in_a_browser(tmp_path: Path) -> None:
     assert "CONSOLE" not in run.stderr
     # One chart of the sensor, two of the first node; the second node has no heat to lay over its temperature.
     assert run.stdout.count("<canvas") == 4
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
+def test_a_page_prints_as_pdf(tmp_path: Path) -> None:
+    from replay.cli.main import main
+
+    (tmp_path / "page.html").write_text(render(example_report(), example_plots()))
+    assert main(["print", str(tmp_path / "page.html")]) == 0
+    assert (tmp_path / "page.pdf").read_bytes().startswith(b"%PDF-")
+    assert main(["print", str(tmp_path / "none.html"), "--out", str(tmp_path / "none.pdf")]) == 2

@@ -152,6 +152,42 @@ def test_the_plots_are_plain_data(run: Run, healthy: Run) -> None:
         assert plots["time"][0] <= plots["holdout_start"] <= plots["time"][-1]
 
 
+@pytest.mark.parametrize("effect", ["radiation_to_sink", "leak_to_boundary", "missing_conductor"])
+def test_the_line_of_a_coupling_lies_on_its_points(effect: str) -> None:
+    """The slope of heat over what drives it is the parameter, in W/K or m2, and the line passes through the points."""
+    run = solved(effect)
+    (drawn,) = run.loop.plots["driven_heat"]
+    (row,) = (r for f in run.report["findings"] for r in f["parameters"].values())
+    x, heat, std, line = (np.array(drawn[key]) for key in ("x", "heat_W", "std_W", "effect_W"))
+    np.testing.assert_allclose(line, row["mean"] * x, rtol=0.02, atol=0.02 * np.abs(line).max())
+    assert np.polyfit(x, heat, 1)[0] == pytest.approx(row["mean"], rel=0.1)
+    assert np.mean(np.abs(heat - line) < 2.0 * std) > 0.9
+
+
+def test_heat_flows_add_up(run: Run) -> None:
+    for phase in run.report["heat_flows"]:
+        net = {node["id"]: 0.0 for node in phase["nodes"]}
+        for link in phase["links"]:
+            for end, sign in zip(link["ends"], (-1.0, 1.0), strict=True):
+                if end in net:
+                    net[end] += sign * link["heat_W"]
+        for node, heat_W in [(row["node"], row["heat_W"]) for row in phase["loads"]]:
+            net[node] += heat_W
+        for effect in phase["effects"]:
+            for node, heat_W in effect["heat_W"].items():
+                net[node] += heat_W
+        assert net == pytest.approx({node["id"]: node["heat_W"] for node in phase["nodes"]}, abs=1e-6)
+
+
+def test_the_ensemble_is_that_of_all_readings(run: Run) -> None:
+    for when in ("before", "after"):
+        figures = run.report["ensemble"][when]
+        assert figures["rmse_K"] == pytest.approx(run.report[when]["rmse_K"])
+        assert figures["bias_K"] ** 2 + figures["std_K"] ** 2 == pytest.approx(figures["rmse_K"] ** 2)
+        assert figures["max_abs_K"] == max(row["max_abs_K"] for row in run.report[when]["per_sensor"].values())
+        assert 0.0 <= figures["share_within"] <= 1.0
+
+
 def test_nothing_is_found_where_nothing_is_missing(healthy: Run) -> None:
     assert healthy.report["verdict"] == "no_effect_supported"
     assert healthy.report["findings"] == []

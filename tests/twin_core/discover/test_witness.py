@@ -74,7 +74,7 @@ def test_without_findings_there_is_nothing_to_agree_with(search):
     row = next(r for r in added["witness"] if r["node"] == "b")
     assert row["agrees"] is None and row["correlation_with_effect"] is None
     assert row["mean_W"] == pytest.approx(4.0, abs=1.5)
-    assert added["words"][0] == "before" and "Latent force at b: the declared model lacks" in " ".join(added["words"])
+    assert added["words"][0] == "before" and "The declared model lacks" in " ".join(added["words"])
     assert added["notices"] == ["old"] and report["words"] == ["before"]
 
 

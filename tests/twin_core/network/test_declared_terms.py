@@ -224,6 +224,14 @@ WRONG = {
     "into a boundary": ({"conductors": [{"between": ["box", "space"], "into": "space"}]}, "which nothing heats"),
     "unknown end": ({"radiation": [{"between": ["box", "moon"], "area_m2": {"value": 1.0}}]}, "'moon'"),
     "two laws": ({"heaters": [{"node": "box"}]}, "exactly one of 'thermostat' and 'proportional'"),
+    "thermostat of another node": (
+        {
+            "heaters": [
+                {"node": "box", "control": "skin", "thermostat": {"on_K": 280, "off_K": 285, "power_W": {"value": 1.0}}}
+            ]
+        },
+        "heaters[0].control: a thermostat is switched by the node that it heats",
+    ),
     "thermostat's band": (
         {"heaters": [{"node": "box", "thermostat": {"on_K": 290.0, "off_K": 280.0, "power_W": {"value": 1.0}}}]},
         "on_K must lie below off_K",

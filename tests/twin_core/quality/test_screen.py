@@ -150,7 +150,10 @@ def test_a_masked_record_says_so_and_is_left_alone_afterwards() -> None:
     assert np.isnan(clean.values["T_a"][[300, 301, 600]]).all() and np.isnan(clean.values["T_a"]).sum() == 3
     (notice,) = clean.notices
     assert "3 reading(s) of 'T_a'" in notice and "first at 18000" in notice
-    assert quality_json([clean]) == [{"channel": "T_a", "reason": "sentinel", "samples": 3, "spans": 2}]
+    (row,) = quality_json([clean])
+    first = row.pop("first")
+    assert row == {"channel": "T_a", "reason": "sentinel", "samples": 3, "spans": 2}
+    assert [span["samples"] for span in first] == [flaw.samples for flaw in clean.flaws or ()]
     assert masked(clean, UNITS) is clean
     assert quality_strip([clean]).count("<title>") == 2
     raw = unmasked(record)

@@ -4,7 +4,8 @@
 
   const data = JSON.parse(document.getElementById("data").textContent);
   const charts = [];
-  let mode = "temperature";
+  const PRINTED = 312; // CSS pixels of one of two columns on A4: the layout of the page is not known before it is printed
+  let printing = false;
 
   const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   const isNumber = (value) => typeof value === "number" && Number.isFinite(value);
@@ -52,7 +53,7 @@
     const chart = { box, readout, build, plot: null };
     chart.draw = () => {
       if (chart.plot) chart.plot.destroy();
-      const width = Math.max(240, box.clientWidth - 24);
+      const width = printing ? PRINTED : Math.max(240, box.clientWidth - 24);
       const { options, columns, read } = build(width);
       const follow = (plot) => (readout.textContent = plot.cursor.idx === null || plot.cursor.idx === undefined ? "" : read(plot.cursor.idx));
       options.hooks = { ...(options.hooks || {}), setCursor: [follow] };
@@ -70,26 +71,22 @@
     plot.ctx.fillRect(left, plot.bbox.top, right - left, plot.bbox.height);
   };
 
-  const minus = (left, right) => left.map((value, i) => (isNumber(value) && isNumber(right[i]) ? value - right[i] : null));
   const timeScale = { x: { time: data.dated } };
   const inUtc = (stamp) => uPlot.tzDate(new Date(stamp * 1000), "Etc/UTC");
 
   function drawSensor(parent, name, sensor) {
     card(parent, name, () => {
-      const residual = mode === "residual";
-      const before = residual ? minus(sensor.measured, sensor.before) : sensor.before;
-      const after = residual ? minus(sensor.measured, sensor.after) : sensor.after;
-      const measured = residual ? sensor.measured.map((value) => (isNumber(value) ? 0 : null)) : sensor.measured;
+      const { measured, before, after } = sensor;
       const start = isNumber(data.holdout_start) ? scaled([data.holdout_start])[0] : null;
       return {
         columns: [scaled(data.time), measured, before, after],
-        read: (i) => `${when(scaled(data.time)[i])}   ${residual ? "" : `${written(measured[i], 2)} · `}${written(before[i], 2)} → ${written(after[i], 2)} K`,
+        read: (i) => `${when(scaled(data.time)[i])}   ${written(measured[i], 2)} · ${written(before[i], 2)} → ${written(after[i], 2)} K`,
         options: {
           scales: timeScale,
           tzDate: inUtc,
           cursor: { sync: { key: "time" }, y: false },
           axes: [timeAxis(), valueAxis("K")],
-          series: [{}, line("measured", "measured", residual ? 1 : 2.5), line("before", "before", 1.6), line("after", "after", 1.6)],
+          series: [{}, line("measured", "measured", 2.5), line("before", "before", 1.6), line("after", "after", 1.6)],
           hooks: isNumber(start) ? { drawClear: [shadeHoldout(start)] } : {},
         },
       };
@@ -132,19 +129,19 @@
     plot.ctx.restore();
   };
 
-  function drawHeatOverTemperature(parent, item) {
-    const [centre, mean, spread, effect] = item.by_temperature.bins;
+  function drawHeatOver(parent, title, unit, over) {
+    const [centre, mean, spread, effect] = over.bins;
     if (centre.length < 2) return;
-    card(parent, `${item.node}: over its temperature`, () => ({
+    card(parent, title, () => ({
       columns: [centre, plusMinus(mean, spread, -1), plusMinus(mean, spread, 1), mean, effect],
-      read: (i) => `${written(centre[i], 1)} K   ${written(mean[i], 1)} ± ${written(2 * spread[i], 1)} W`,
+      read: (i) => `${written(centre[i], 1)} ${unit}   ${written(mean[i], 1)} ± ${written(2 * spread[i], 1)} W`,
       options: {
         scales: { x: { time: false } },
         cursor: { y: false },
-        axes: [axis({ size: 30, values: (_, splits) => splits.map((value) => `${+value.toFixed(3)} K`) }), valueAxis("W")],
+        axes: [axis({ size: 30, values: (_, splits) => splits.map((value) => `${+value.toFixed(3)} ${unit}`) }), valueAxis("W")],
         series: [{}, edge(), edge(), line("heat", "heat", 2), line("effect", "after", 2, { dash: [7, 5] })],
         bands: band(),
-        hooks: { drawAxes: [cloud(item.by_temperature.points)] },
+        hooks: { drawAxes: [cloud(over.points)] },
       },
     }));
   }
@@ -157,20 +154,14 @@
     const heat = document.getElementById("heat");
     if (heat) {
       data.missing_heat.forEach((item) => {
-        drawHeatOverTemperature(heat, item);
+        if (item.by_temperature) drawHeatOver(heat, `${item.node}: over its temperature`, "K", item.by_temperature);
         drawHeatOverTime(heat, item);
       });
     }
+    const driven = document.getElementById("driven");
+    if (driven) data.driven_heat.forEach((item) => drawHeatOver(driven, `into ${item.node}, over ${item.axis}`, item.unit, item.over));
     redraw();
   }
-
-  document.querySelectorAll("[data-mode]").forEach((button) => {
-    button.addEventListener("click", () => {
-      mode = button.dataset.mode;
-      document.querySelectorAll("[data-mode]").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
-      redraw();
-    });
-  });
 
   let pending = 0;
   const soon = () => {
@@ -183,11 +174,12 @@
     width = innerWidth;
   });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", soon);
-  const printing = (on) => () => {
+  const print = (on) => () => {
+    printing = on;
     document.documentElement.classList.toggle("printing", on);
     redraw();
   };
-  addEventListener("beforeprint", printing(true));
-  addEventListener("afterprint", printing(false));
+  addEventListener("beforeprint", print(true));
+  addEventListener("afterprint", print(false));
   build();
 })();
