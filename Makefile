@@ -4,10 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 BENCH := $(VENV)/.bench
+GROUND := $(VENV)/.ground
 DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
+.PHONY: demo test test-fast test-ground check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -18,6 +19,11 @@ $(STAMP): pyproject.toml
 
 $(BENCH): $(STAMP)
 	$(BIN)/pip install --quiet --editable ".[bench,neural]"
+	touch $@
+
+$(GROUND): $(STAMP)
+	$(BIN)/pip install --quiet --editable ".[dev,neural,ground]"
+	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/openmct openmct@4
 	touch $@
 
 $(DOCS): $(STAMP)
@@ -31,10 +37,10 @@ demo: $(STAMP)
 PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
-	$(PYTEST)
+	$(PYTEST) -m "not ground"
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow and not e2e and not browser"
+	$(PYTEST) -m "not slow and not e2e and not browser and not ground"
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -77,6 +83,10 @@ bench-service: $(STAMP)
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b
+
+# Beside the products of a control room themselves: Yamcs, Open MCT, Prometheus. What is not installed is skipped.
+test-ground: $(GROUND)
+	$(BIN)/pytest -m ground
 
 serve: $(STAMP)
 	$(BIN)/twin serve

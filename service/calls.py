@@ -78,6 +78,11 @@ def job(name: str, kind: schemas.JobKind, job_id: str) -> Call[schemas.Job]:
     return Call("GET", f"/v1/twins/{name}/{_ROOM[kind]}/{job_id}", schemas.Job)
 
 
+def jobs(name: str, kind: schemas.JobKind) -> Call[schemas.JobList]:
+    """List the jobs of one kind."""
+    return Call("GET", f"/v1/twins/{name}/{_ROOM[kind]}", schemas.JobList)
+
+
 def cancel_job(name: str, kind: schemas.JobKind, job_id: str) -> Call[schemas.Job]:
     """Cancel a job."""
     return Call("DELETE", f"/v1/twins/{name}/{_ROOM[kind]}/{job_id}", schemas.Job)

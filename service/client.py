@@ -193,6 +193,10 @@ class TwinClient:
         """Start a diagnosis; the settings are those of ``DiagnosisRequest``."""
         return self.send(calls.start_job(name, "diagnosis", settings))
 
+    def jobs(self, name: str, kind: schemas.JobKind) -> list[schemas.Job]:
+        """Return the jobs of one kind, the newest first."""
+        return self.send(calls.jobs(name, kind)).jobs
+
     def job(self, name: str, job: schemas.Job) -> schemas.Job:
         """Return the present state of a job."""
         return self.send(calls.job(name, job.kind, job.id))
@@ -226,6 +230,10 @@ class TwinClient:
     def models(self, name: str) -> list[schemas.ModelInfo]:
         """Return every version of the model."""
         return self.send(calls.models(name)).models
+
+    def activations(self, name: str) -> list[schemas.Activation]:
+        """Return when and why versions became the active one, the newest first."""
+        return self.send(calls.models(name)).activations
 
     def model(self, name: str, version: int) -> schemas.ModelDetail:
         """Return one version, with the model document itself in ``model``."""

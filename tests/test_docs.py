@@ -36,17 +36,25 @@ def blocks(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("name", twin.commands)
+def commands() -> dict[str, click.Command]:
+    """Return every command by its words, those of groups included."""
+    found: dict[str, click.Command] = {}
+    for name, command in twin.commands.items():
+        found |= {f"{name} {word}": part for word, part in getattr(command, "commands", {}).items()} or {name: command}
+    return found
+
+
+@pytest.mark.parametrize("name", commands())
 def test_every_option(name: str) -> None:
     text = section("cli.md", f"twin {name}")
-    for parameter in twin.commands[name].params:
+    for parameter in commands()[name].params:
         if isinstance(parameter, click.Option):
             for flag in parameter.opts:
                 assert f"`{flag}" in text, f"docs/cli.md: twin {name} {flag} is missing"
 
 
 def test_no_option_that_is_gone() -> None:
-    for name, command in twin.commands.items():
+    for name, command in commands().items():
         known = {flag for parameter in command.params for flag in parameter.opts}
         rows = re.findall(r"^\| `(--[a-z-]+)", section("cli.md", f"twin {name}"), re.MULTILINE)
         assert set(rows) <= known, name

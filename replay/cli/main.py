@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import click
 
 from replay.cli.balance import balance
+from replay.cli.bridge import bridge
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
@@ -62,7 +63,7 @@ for command in (
         close_loop,
         check_effect,
     ),
-    *(backup, restore, migrate),
+    *(bridge, backup, restore, migrate),
 ):
     twin.add_command(command)
 

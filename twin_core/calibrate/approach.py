@@ -95,10 +95,10 @@ def approach(
     return replace(best, iterations=iterations)
 
 
-def coarse_problem(problem: Problem, step_s: float) -> Problem:
-    """Return a problem on thinned records, whose time steps are longer by as much; itself where records are short."""
+def coarse_problem(problem: Problem, step_s: float, n_samples: int = COARSE_SAMPLES) -> Problem:
+    """Return a problem on records thinned to ``n_samples`` at least, with longer steps; itself where records are short."""
     records = [segment.record for segment in problem.segments]
-    stride = sum(r.time_s.size for r in records) // COARSE_SAMPLES
+    stride = sum(r.time_s.size for r in records) // n_samples
     if stride < 2 or min(r.time_s.size for r in records) < 10 * stride:
         return problem
     thin = [thinned(problem.network.spec, record, stride) for record in records]

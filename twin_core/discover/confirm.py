@@ -15,6 +15,7 @@ from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
+from twin_core.discover import policy
 from twin_core.discover.once import once
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
@@ -30,13 +31,6 @@ OPENING_SHARE = 0.1
 
 MOST_FOLDS = 4
 """Groups of segments that are left out in turn."""
-
-BETWEEN_SESSIONS = 0.5
-"""Of what a law gains on blocks, this share must be gained on sessions that it was not fitted to."""
-
-LARGEST_NOISE = 1.5
-"""How much larger than calibration took it to be a sensor's noise may be: from few differences of readings it is known to a
-third."""
 
 LN_2 = float(np.log(2.0))
 
@@ -76,7 +70,9 @@ class Trial:
             values = self.fit.network.parameters.as_dict()
             start = carried_over(self.simpler.calibration(), self.fit.problem, values)
             near.append(minimise(self.fit.problem, start))
-        return from_heat_fit(self.fit, self.max_step_s, near=near)
+        return from_heat_fit(
+            self.fit, self.max_step_s, near=near, afresh=not any(o.status == "converged" for o in near)
+        )
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:
@@ -123,7 +119,7 @@ class Trial:
         calibration = self.calibration()
         interval_s = sampling_step_s([segment.record for segment in calibration.problem.segments])
         own = np.array([model.unforeseen(interval_s) for model in calibration.whitener.models])
-        noise = np.maximum(np.minimum(own, LARGEST_NOISE * calibration.problem.noise_K), 1e-300)
+        noise = np.maximum(np.minimum(own, policy.LARGEST_NOISE * calibration.problem.noise_K), 1e-300)
         square = np.nanmean((np.concatenate(calibration.residuals) / noise) ** 2, axis=0)
         return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
 
@@ -378,7 +374,7 @@ class Validation:
         their geometric mean counts, and once more what makes one of them worse.
         """
         if self.n_sessions > 1 and self.is_law:
-            is_told_by_all = 1.0 - self.forward_ratio >= BETWEEN_SESSIONS * (1.0 - self.ratio)
+            is_told_by_all = 1.0 - self.forward_ratio >= policy.BETWEEN_SESSIONS * (1.0 - self.ratio)
             return self.forward_ratio if is_told_by_all else 1.0
         return float(np.sqrt(self.ratio * self.forward_ratio)) * max(1.0, self.ratio, self.forward_ratio)
 

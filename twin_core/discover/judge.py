@@ -8,31 +8,25 @@ from typing import TypeVar
 import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
+from twin_core.discover import policy
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError
+from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
 
 N_VALIDATED, N_VALIDATED_FREE = 3, 8
 """Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
 
-ALTERNATIVE_NATS = 3.0
-FORESIGHT = 0.97
-"""An effect must lower the error on what it was not fitted to by 3 % at least, or it is not worth its name."""
-
-UNEXPLAINED_SHARE = 1.0
-"""Misfit over noise beyond which a record without a supported effect is called unexplained."""
-
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
-REPEATABLE_SHARE = 0.1
-"""A name stands while the repeatable heat that it leaves is worth less than so much of its own evidence."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +93,8 @@ class Search:
         Candidates whose arithmetic failed, with the reason.
     left_out
         What was not looked at for want of time.
+    every
+        Of how many samples of the training record the search looked at one.
     """
 
     trial: Trial
@@ -109,6 +105,7 @@ class Search:
     rejected: list[Judged] = field(default_factory=list)
     failures: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
+    every: int = 1
 
     def fork(self) -> "Search":
         """Return a search that starts from here and shares what failed or was left out."""
@@ -125,7 +122,7 @@ class Search:
         A candidate whose values run away is as unlikely as can be: NumPy's warnings on the way are nobody's business.
         """
         try:
-            with limited(self.deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            with limited(self.deadline), hurried(), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 check_time()
                 return attempted(work, what, self.failures)
         except TimeIsUpError:
@@ -176,9 +173,14 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
 
 
 def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
-    """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law."""
+    """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
+
+    A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
+    """
+    if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
+        return replace(judged, reason=LESS_LIKELY), False
     validation = validate(simple, judged.trial)
-    if not validation.foresight < FORESIGHT:
+    if not validation.foresight < policy.FORESIGHT:
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     resembles = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=NO_LAW if resembles else ""), resembles
@@ -196,7 +198,7 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
 
 def most_left(log_bayes_factor: float, needed: float) -> float:
     """Return how much evidence a repeatable heat beside a name may have, given that of the name."""
-    return max(needed, REPEATABLE_SHARE * log_bayes_factor)
+    return max(needed, policy.REPEATABLE_SHARE * log_bayes_factor)
 
 
 def mean_excess(trial: Trial) -> float:
@@ -229,4 +231,4 @@ def worth(judged: Judged) -> float:
 
 def is_close(other: Judged, best: Judged) -> bool:
     """Return whether the data hardly tell another option from the best one."""
-    return other.evidence.log_bayes_factor > best.evidence.log_bayes_factor - ALTERNATIVE_NATS
+    return other.evidence.log_bayes_factor > best.evidence.log_bayes_factor - policy.ALTERNATIVE_NATS

@@ -14,11 +14,13 @@ from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.discover import policy
 from twin_core.discover.confirm import Trial
 from twin_core.discover.dossier import provenance
 from twin_core.discover.driven import driven_heat
 from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
-from twin_core.discover.judge import NO_MODEL, UNEXPLAINED_SHARE, Search
+from twin_core.discover.judge import NO_MODEL, Search
+from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.mistakes import told_mistakes
 from twin_core.discover.plots import build_plots
 from twin_core.discover.report import build_report
@@ -130,14 +132,16 @@ def _close_loop(
     train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
     fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
-    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    base, every = searched(whole)
     found = search(
         base,
         false_alarm_rate=false_alarm_rate,
         deadline=deadline,
         progress=lambda f, m: progress(0.35 + 0.5 * f, m),
     )
-    after = _corrected_or(before, found) if found.findings else before
+    found.every = every
+    after = _corrected_or(before, whole, found) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
     report = build_report(found, before, after, held, predictions, verdict_of(found))
@@ -156,9 +160,9 @@ def _close_loop(
     return ClosedLoop(report, after, before, plots)
 
 
-def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
+def _corrected_or(before: CalibratedModel, whole: Trial, found: Search) -> CalibratedModel:
     """Return the corrected model; where its arithmetic fails the findings are given up, told, and the declared one stays."""
-    after = attempted(partial(corrected, found), "the corrected model", found.failures)
+    after = attempted(partial(corrected, whole, found), "the corrected model", found.failures)
     if after is None:
         found.rejected += [replace(f.judged, reason=NO_MODEL) for f in found.findings]
         found.findings, found.trial = [], found.base
@@ -166,9 +170,10 @@ def _corrected_or(before: CalibratedModel, found: Search) -> CalibratedModel:
     return after
 
 
-def corrected(found: Search) -> CalibratedModel:
-    """Return the model with the findings; what the record leaves open of them lies in the middle of where it may be."""
-    return centred(to_model(found.trial.calibration(), found.trial.present_effects), found.trial.fit)
+def corrected(whole: Trial, found: Search) -> CalibratedModel:
+    """Return the model with the findings on the whole record; what that leaves open lies in the middle of where it may be."""
+    trial = on_all_samples(whole, found.trial)
+    return centred(to_model(trial.calibration(), trial.present_effects), trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:
@@ -217,5 +222,5 @@ def verdict_of(found: Search) -> str:
     """Return the verdict: an effect was added, the record is healthy, or something is there that nobody can name."""
     if found.findings:
         return "effect_added"
-    unexplained = found.base.misfit_share() > UNEXPLAINED_SHARE
+    unexplained = found.base.misfit_share() > policy.UNEXPLAINED_SHARE
     return "unexplained" if unexplained else "no_effect_supported"

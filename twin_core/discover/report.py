@@ -142,6 +142,14 @@ def _left_out(search: Search) -> list[str]:
     return [f"the deadline ended the search: this is the best answer so far; not looked at: {some}{more}"]
 
 
+def _thinned(search: Search) -> list[str]:
+    """Return what of a long record the search looked at, in words."""
+    if search.every == 1:
+        return []
+    share = f"one of {search.every} samples"
+    return [f"the record is long: effects were searched on {share}; both models were calibrated on all of them"]
+
+
 def unexplained_share(calibration: Calibration) -> float:
     """Return the part of the open-loop residuals' variance over the training part that is beyond the sensors' noise."""
     scaled = np.concatenate(calibration.residuals) / calibration.problem.noise_K
@@ -236,11 +244,16 @@ def build_report(
         "heat_flows": attempted(lambda: heat_flow_maps(search, after), "heat flows", failures) or [],
         "excluded": left_out(before.spec),
         "failures": list(dict.fromkeys(search.failures)),
-        "search": {"complete": not search.left_out, "left_out": len(search.left_out)},
+        "search": {
+            "complete": not search.left_out,
+            "left_out": len(search.left_out),
+            "every": search.every,
+        },
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
             *_left_out(search),
+            *_thinned(search),
             *before.summary["notices"],
             *(notice for p in predictions[1] for notice in p.notices),
         ],

@@ -1,7 +1,7 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -12,8 +12,21 @@ import numpy as np
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.latent_heat import gain_of_latent_heat
+from twin_core.discover import policy
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
-from twin_core.discover.judge import NO_MORE, Judged, Search, accept, mean_excess, once_each, threshold, worth
+from twin_core.discover.judge import (
+    LESS_LIKELY,
+    NO_FORESIGHT,
+    NO_MORE,
+    Finding,
+    Judged,
+    Search,
+    accept,
+    mean_excess,
+    once_each,
+    threshold,
+    worth,
+)
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
@@ -32,23 +45,6 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
-
-DOUBTFUL = 0.8
-"""Foresight from which a finding of the innovations is held against what open-loop residuals suggest: the better one counts."""
-
-LEAST_EXCESS = 0.1
-"""Variance of open-loop residuals beyond the noise, in units of that noise, at one sensor at least: else nothing is missing."""
-
-DOMINANCE = 3.0
-"""A name must explain so many times the variance that stays unexplained, as far as a lumped network may leave that."""
-
-COARSEST = 4.0
-"""Variance, in units of the sensors' noise, up to which what stays unexplained may be a lumped network's coarseness: a misfit
-of two noises."""
-
-WIDENED = 1.0
-"""Variance, in units of the sensors' noise, that must stay unexplained beside a finding for pairs and trajectories to be
-asked as well: the coarseness of a lumped network is as large."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -95,20 +91,21 @@ def search(
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: bool(state.trial.excess().max() < LEAST_EXCESS), "how well trajectories fit"):
+    if state.attempt(lambda: bool(state.trial.excess().max() < policy.LEAST_EXCESS), "how well trajectories fit"):
         return False
     missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
-    widened = not state.findings or mean_excess(state.trial) > WIDENED
+    widened = not state.findings or mean_excess(state.trial) > policy.WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if not widened or (told and by_heat.findings[-1].foresight < DOUBTFUL):
+    if not widened or (told and mean_excess(by_heat.trial) <= policy.MOST_COARSENESS):
         state.join(by_heat)
         return bool(told)
-    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback)
+    beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
+    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback, beside=beside)
     seen = state.attempt(second, f"{what}, by open-loop residuals")
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
     if not options:
@@ -116,6 +113,15 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         return False
     state.join(min(options, key=lambda fork: fork.findings[-1].foresight))
     return True
+
+
+def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
+    """Return the likeliest single effect that was refused for what it does to trajectories, if any.
+
+    A lagging sensor, say, shows between neighbouring readings and changes no long trajectory; what does may show beside it only.
+    """
+    singles = [j for j in refused if j.reason in (NO_FORESIGHT, LESS_LIKELY) and len(j.effects) == 1]
+    return [min(singles, key=worth).trial] if singles else []
 
 
 def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool) -> bool:
@@ -216,26 +222,53 @@ def _judge(
 
 
 def withdraw(state: Search) -> None:
-    """Withdraw findings that explain no more than what stays unexplained: both may be what a lumped network cannot follow.
+    """Withdraw findings that explain no more than a lumped network may leave: both may be its coarseness.
 
     Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
-    counts as unexplained. A heat without a name claims nothing but to predict: beside it, all that stays counts.
+    counts as unexplained, unless the others explain it too.
     """
     while state.findings:
-        left = mean_excess(state.trial)
         weakest = min(state.findings, key=lambda finding: finding.explained)
         is_named = not all(effect.fallback for effect in weakest.effects)
-        if weakest.explained >= DOMINANCE * (min(left, COARSEST) if is_named else left):
+        if weakest.explained >= least_explained(mean_excess(state.trial), state.trial.n_samples, is_named=is_named):
             return
         state.findings = [finding for finding in state.findings if finding is not weakest]
         state.rejected.append(replace(weakest.judged, reason=NO_MORE))
         places = {effect.place for effect in weakest.effects}
-        others = [effect for effect in state.trial.effects if effect.place not in places]
-        work = partial(try_effects, state.trial, others, n_passes=10)
-        kept = state.attempt(work, "the model without what explains no more than what stays") if others else state.base
+        work = partial(_without, state, places)
+        kept = state.attempt(work, "the model without what explains no more than what stays")
         if kept is None:
             state.findings, kept = [], state.base
         state.trial = kept
+        state.findings = [_explaining(state, finding) for finding in state.findings]
+
+
+def least_explained(left: float, n_readings: int, *, is_named: bool) -> float:
+    """Return the variance that a finding must explain beside what stays unexplained, both in units of the sensors' noise.
+
+    That a network is coarse at all is seen where more stays than chance leaves of ``n_readings`` independent readings, whose
+    variance has a standard error of sqrt(2 / n). A heat without a name claims nothing but to predict: all that stays counts.
+    """
+    if not is_named:
+        return policy.DOMINANCE * left
+    by_chance = policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
+    shown = min(max(left / by_chance - 1.0, 0.0), 1.0)
+    return policy.DOMINANCE * min(max(left, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
+
+
+def _explaining(state: Search, finding: Finding) -> Finding:
+    """Return a finding with what it explains beside the others as they are now; as it is where that cannot be told."""
+    work = partial(_without, state, {effect.place for effect in finding.effects})
+    without = state.attempt(work, f"the model without {finding.judged.labels}")
+    if without is None:
+        return finding
+    return replace(finding, explained=mean_excess(without) - mean_excess(state.trial))
+
+
+def _without(state: Search, places: Collection[object]) -> Trial:
+    """Return the state's trial without the effects at some places."""
+    others = [effect for effect in state.trial.effects if effect.place not in places]
+    return try_effects(state.trial, others, n_passes=10) if others else state.base
 
 
 def prune(state: Search, needed: float) -> None:
@@ -247,10 +280,9 @@ def prune(state: Search, needed: float) -> None:
 
 def _drop(state: Search, place: object, needed: float) -> None:
     """Drop the effect at a place if the model without it is hardly less likely."""
-    others = [e for e in state.trial.effects if e.place != place]
-    if not others:
+    if all(effect.place == place for effect in state.trial.effects):
         return
-    found = state.attempt(partial(_without, state.trial, others), f"the model without {place}")
+    found = state.attempt(partial(_weighed_without, state, place), f"the model without {place}")
     if found is None:
         return
     without, worth_of_it = found
@@ -261,7 +293,7 @@ def _drop(state: Search, place: object, needed: float) -> None:
     state.findings = [f for f in state.findings if f.effects]
 
 
-def _without(trial: Trial, others: Sequence[Effect]) -> tuple[Trial, float]:
-    """Return the trial with only some of its effects, and the log Bayes factor of what was dropped."""
-    without = try_effects(trial, others, n_passes=10)
-    return without, weigh(without, trial, 1).log_bayes_factor
+def _weighed_without(state: Search, place: object) -> tuple[Trial, float]:
+    """Return the trial without the effect at a place, and the log Bayes factor of what was dropped."""
+    without = _without(state, {place})
+    return without, weigh(without, state.trial, 1).log_bayes_factor

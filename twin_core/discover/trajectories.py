@@ -33,7 +33,7 @@ N_KEPT, N_SETTLED = 4, 2
 """Sets of effects that are extended by one more, and that are fitted in the presence of undeclared heat too."""
 
 
-def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> bool:
+def extend_by_trajectory(state: Search, needed: float, *, fallback: bool, beside: Sequence[Trial] = ()) -> bool:
     """Add the effect, or the effects that only pay off together, that open-loop residuals suggest; False if none holds.
 
     Parameters
@@ -44,6 +44,8 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
         Log Bayes factor that is asked for.
     fallback
         Whether to try the effects without a name.
+    beside
+        Trials that are extended by one more effect too: what may only pay off together with another.
     """
     misfit = state.trial.misfit_share()
     if misfit < LEAST_MISFIT_SHARE:
@@ -57,7 +59,7 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool) -> boo
         n_tried = comb(state.n_named, n_together)
         if accept(state, [*_settled(state, sets[:N_SETTLED], n_tried, needed), *sets], needed):
             return True
-        seeds = [j.trial for j in sets]
+        seeds = [*(j.trial for j in sets), *beside]
     return False
 
 

@@ -7,6 +7,9 @@ Newton's method for a whole stretch. One that does not converge is cut, down to 
 steps that do are kept.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +25,22 @@ TOLERANCE_K = 1e-7
 N_NEWTON = 25
 LIMIT_K = (0.5, 5.0e3)
 """Temperatures that iterates may visit; a solution at a limit is not a solution."""
+
+MOST_PIECES = 16
+"""Pieces into which a candidate's stretch may be cut (see :func:`hurried`): one that makes sense takes a few, one that has run
+away hundreds."""
+
+_most_pieces: ContextVar[float] = ContextVar("most_pieces", default=np.inf)
+
+
+@contextmanager
+def hurried() -> Iterator[None]:
+    """Give up rollouts in this thread that would take many times the usual work: they are then not converged."""
+    token = _most_pieces.set(MOST_PIECES)
+    try:
+        yield
+    finally:
+        _most_pieces.reset(token)
 
 
 @dataclass(frozen=True)
@@ -91,8 +110,11 @@ def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArra
         solved, _, n_solved = march(step_s, split.modes, left, split.relays, given, start_K[None], low, high)
         out[:n_solved] = solved[:n_solved]
         return n_solved
-    state, done, stretch = start_K, 0, n_steps
+    state, done, stretch, n_pieces = start_K, 0, n_steps, 0
     while done < n_steps:
+        n_pieces += 1
+        if n_pieces > _most_pieces.get():
+            return done
         last = min(done + stretch, n_steps)
         guess = np.broadcast_to(state, (last - done, 2, state.size)) if near is None else near[done:last]
         solved = _newton(split, state, split.first + done, split.first + last, guess)

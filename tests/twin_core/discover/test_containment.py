@@ -90,7 +90,7 @@ def test_a_deadline_is_told_in_the_report() -> None:
     report = close_loop(case.spec, [case.record], deadline_s=1e-3).report
     assert report["findings"] == []
     assert any("the deadline ended the search" in notice for notice in report["notices"])
-    assert report["search"] == {"complete": False, "left_out": report["search"]["left_out"]}
+    assert report["search"] == {"complete": False, "left_out": report["search"]["left_out"], "every": 1}
     assert "deadline ended the search" in headline(report) and "suffices" not in headline(report)
     assert report["witness"] == [] and any("the time is up" in notice for notice in report["notices"])
 

@@ -2,22 +2,23 @@
 
 from dataclasses import dataclass, field, replace
 from threading import Barrier, Thread
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from twin_core.discover import judge
+from twin_core.discover import judge, policy
 from twin_core.discover import search as searching
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
-    ALTERNATIVE_NATS,
-    FORESIGHT,
+    LESS_LIKELY,
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
-    REPEATABLE_SHARE,
     Finding,
     Judged,
     Search,
@@ -29,12 +30,25 @@ from twin_core.discover.judge import (
     threshold,
 )
 from twin_core.discover.once import once
-from twin_core.discover.search import COARSEST, DOMINANCE, withdraw
+from twin_core.discover.policy import (
+    ALTERNATIVE_NATS,
+    DOMINANCE,
+    FORESIGHT,
+    LEAST_COARSENESS,
+    MOST_COARSENESS,
+    REPEATABLE_SHARE,
+    THRESHOLDS,
+    VISIBLE_COARSENESS,
+)
+from twin_core.discover.search import least_explained, withdraw
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
 JUST = 1e-6
 NEEDED = 4.6
+LEAST, MOST = LEAST_COARSENESS, MOST_COARSENESS
+N_READINGS = 5000
+CHANCE = VISIBLE_COARSENESS * float(np.sqrt(2.0 / N_READINGS))
 
 
 @dataclass
@@ -54,6 +68,7 @@ class Stub:
     effects: tuple[Effect, ...] = ()
     left: float = 0.0
     n_free: int = 3
+    n_samples: int = N_READINGS
     fit: Fit = field(init=False)
 
     def __post_init__(self) -> None:
@@ -179,15 +194,17 @@ def test_what_is_accepted(options: list[Judged], named: str | None, reasons: lis
     ("explained", "left", "kept"),
     [
         ([5.0, 0.2], 0.0, ["n0", "n1"]),
-        ([5.0, 0.2], 0.2 / DOMINANCE, ["n0", "n1"]),
-        ([5.0, 0.2], 0.2 / DOMINANCE + JUST, ["n0"]),
-        ([0.2, 5.0], 0.5, ["n1"]),
-        ([1.0, 1.0], 0.5, []),
-        ([DOMINANCE * COARSEST, 900.0], 50.0, ["n0", "n1"]),
-        ([DOMINANCE * COARSEST - JUST, 900.0], 50.0, ["n1"]),
+        ([9.0, DOMINANCE * CHANCE], CHANCE, ["n0", "n1"]),
+        ([9.0, DOMINANCE * LEAST], 2.0 * CHANCE, ["n0", "n1"]),
+        ([9.0, DOMINANCE * LEAST - JUST], 2.0 * CHANCE, ["n0"]),
+        ([0.2, 9.0], 0.5, ["n1"]),
+        ([2.0, 2.5], 0.5, []),
+        ([DOMINANCE * MOST, 900.0], 50.0, ["n0", "n1"]),
+        ([DOMINANCE * MOST - JUST, 900.0], 50.0, ["n1"]),
     ],
     ids=[
         "fits to the noise",
+        "by chance",
         "just enough",
         "too little",
         "the weakest",
@@ -223,6 +240,39 @@ def test_beside_a_heat_without_a_name_all_that_stays_counts(explained: float, st
     state.findings = [Finding(option, (), explained)]
     withdraw(state)
     assert bool(state.findings) == stands
+
+
+@pytest.mark.parametrize(("change", "reason"), [(0.0, ""), (-JUST, LESS_LIKELY)])
+def test_a_correction_does_not_make_its_own_trajectories_less_likely(
+    monkeypatch: pytest.MonkeyPatch, change: float, reason: str
+) -> None:
+    """However much heat that wanders at the nodes may speak for it."""
+    option = judged("a", 900.0)
+    along = {True: 5.0, False: 5.0 + change}
+    simple = stub()
+    monkeypatch.setattr(
+        Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
+    )
+    monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
+    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: False)
+    assert judge._examined(simple, option, NEEDED)[0].reason == reason
+
+
+@given(st.floats(0.0, 1e6), st.floats(1.0, 2.0), st.integers(10, 10**7))
+def test_what_a_name_must_explain_grows_with_what_stays_without_a_cliff(left: float, factor: float, n: int) -> None:
+    """It never grows faster than it does where a network begins to be seen as coarse."""
+    least, more = (least_explained(value, n, is_named=True) for value in (left, left * factor))
+    steepest = DOMINANCE * max(1.0, LEAST / (VISIBLE_COARSENESS * np.sqrt(2.0 / n)))
+    assert 0.0 <= least <= more <= DOMINANCE * MOST
+    assert more - least <= steepest * (factor - 1.0) * left * (1.0 + 1e-9)
+
+
+def test_thresholds_are_few_and_each_says_what_it_is() -> None:
+    stated = {name for name, value in vars(policy).items() if name.isupper() and isinstance(value, float)}
+    assert stated == set(THRESHOLDS) and len(stated) <= 12
+    for name, about in THRESHOLDS.items():
+        assert about.unit and about.asks and about.origin, name
+        assert len({about.off, about.half, about.double, getattr(policy, name)}) == 4, name
 
 
 def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:

@@ -124,7 +124,7 @@ def found(request: pytest.FixtureRequest) -> Found:
         base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         state = search(base, false_alarm_rate=0.01, progress=no_progress)
         (seen,) = bear_witness(state).heats
-        return Found(world, spec, record, corrected(state), seen)
+        return Found(world, spec, record, corrected(base, state), seen)
 
 
 def latent_law(found: Found) -> ForcePolynomial:

@@ -1,0 +1,147 @@
+"""Policy: the thresholds by which the closed loop believes or disbelieves, and where each comes from.
+
+What bounds only how much is looked at (how many candidates are fitted further, say) is a budget and stands where it is spent.
+``make bench-ablation`` prints what every threshold does to a suite when it is off, half or double.
+"""
+
+from dataclasses import dataclass
+
+LEAST_EXCESS = 0.1
+DOMINANCE = 2.0
+LEAST_COARSENESS = 1.5
+MOST_COARSENESS = 4.0
+VISIBLE_COARSENESS = 1.0
+WIDENED = 1.0
+FORESIGHT = 0.97
+BETWEEN_SESSIONS = 0.5
+REPEATABLE_SHARE = 0.1
+ALTERNATIVE_NATS = 3.0
+LARGEST_NOISE = 1.5
+UNEXPLAINED_SHARE = 1.0
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """What a threshold of this module is.
+
+    Attributes
+    ----------
+    unit
+        Of its value.
+    asks
+        What it decides.
+    origin
+        Why it has this value.
+    off, half, double
+        Its values without the rule, and asking half and twice as much.
+    """
+
+    unit: str
+    asks: str
+    origin: str
+    off: float
+    half: float
+    double: float
+
+
+NOISE_VARIANCE = "variance of a sensor's noise"
+
+THRESHOLDS: dict[str, Threshold] = {
+    "LEAST_EXCESS": Threshold(
+        NOISE_VARIANCE,
+        "open-loop residuals above it at one sensor at least, or nothing is missing",
+        "three standard errors of a variance told by some 2,000 readings: 3 sqrt(2 / 2000)",
+        0.0,
+        0.05,
+        0.2,
+    ),
+    "DOMINANCE": Threshold(
+        "ratio",
+        "a name explains so many times what a lumped network may leave beside it",
+        "a name that explains less than what stays could be the same coarseness; twice tells them apart within a factor sqrt 2",
+        0.0,
+        1.0,
+        4.0,
+    ),
+    "LEAST_COARSENESS": Threshold(
+        NOISE_VARIANCE,
+        "what a network that is coarse at all counts as leaving, because names may have soaked it up",
+        "healthy finite-element spacecraft, whose misfit is one to two noises",
+        0.0,
+        0.75,
+        3.0,
+    ),
+    "MOST_COARSENESS": Threshold(
+        NOISE_VARIANCE,
+        "what stays beyond it is no coarseness, and is not held against a name",
+        "a misfit of two noises",
+        1e12,
+        2.0,
+        8.0,
+    ),
+    "VISIBLE_COARSENESS": Threshold(
+        "standard errors of the variance of that many readings",
+        "what stays from which a network is taken to be coarse, wholly so from twice as much",
+        "one standard error: what stays is a mean over sensors of what exceeds their noise, which chance alone makes positive",
+        1e-12,
+        0.5,
+        2.0,
+    ),
+    "WIDENED": Threshold(
+        NOISE_VARIANCE,
+        "what stays beside a finding from which pairs and trajectories are asked as well",
+        "a misfit as large as the noise",
+        0.0,
+        0.5,
+        2.0,
+    ),
+    "FORESIGHT": Threshold(
+        "ratio",
+        "error on what a finding was not fitted to, after over before, below it",
+        "three per cent: what a leave-out over eight blocks varies by chance on healthy records",
+        1e12,
+        0.985,
+        0.94,
+    ),
+    "BETWEEN_SESSIONS": Threshold(
+        "share",
+        "of what a law gains within sessions, so much is gained on sessions that it was not fitted to",
+        "half: the other half may be what differs from session to session",
+        -1e12,
+        0.25,
+        1.0,
+    ),
+    "REPEATABLE_SHARE": Threshold(
+        "share of evidence",
+        "a name leaves no heat that repeats with temperature and is worth more than so much of its own evidence",
+        "a tenth: a law with a parameter of its own that is off by a third of its value leaves about as much",
+        1e12,
+        0.2,
+        0.05,
+    ),
+    "ALTERNATIVE_NATS": Threshold(
+        "nats",
+        "names closer than this are told as alternatives, and the simplest of them leads",
+        "odds of 20 to 1: positive evidence on the scale of Kass and Raftery (1995)",
+        0.0,
+        1.5,
+        6.0,
+    ),
+    "LARGEST_NOISE": Threshold(
+        "ratio",
+        "noise that residuals show counts up to so many times what calibration took it to be; more is misfit",
+        "noise told by few differences of readings is known to a third",
+        1e12,
+        1.25,
+        2.0,
+    ),
+    "UNEXPLAINED_SHARE": Threshold(
+        "ratio of standard deviations",
+        "misfit over noise beyond which a record without a finding is called unexplained",
+        "a misfit as large as the noise",
+        1e12,
+        0.5,
+        2.0,
+    ),
+}
+"""At most twelve, each with its unit, its origin and what its ablation sets it to."""
