@@ -14,6 +14,7 @@ from replay.cli.bridge import bridge
 from replay.cli.calibrate import calibrate
 from replay.cli.check_effect import check_effect
 from replay.cli.close_loop import close_loop
+from replay.cli.convert import convert
 from replay.cli.correlate import correlate
 from replay.cli.demo import demo
 from replay.cli.export import export
@@ -58,6 +59,7 @@ for command in (
         replay,
         record,
         import_model,
+        convert,
         calibrate,
         correlate,
         forecast,
