@@ -30,7 +30,8 @@ for (const plugin of ['LocalStorage', 'Espresso', 'MyItems', 'UTCTimeSystem']) {
 }
 const query = new URLSearchParams(location.search);
 const minutes = (name, usual) => 60_000 * Number(query.get(name) ?? usual);
-const fixed = { start: Date.now() - minutes('back', 60), end: Date.now() + minutes('ahead', 60) };
+const at = (name, usual) => query.has(name) ? Date.parse(query.get(name)) : usual;
+const fixed = { start: at('start', Date.now() - minutes('back', 60)), end: at('stop', Date.now() + minutes('ahead', 60)) };
 openmct.install(openmct.plugins.Conductor({
   menuOptions: [
     { name: 'Fixed', timeSystem: 'utc', bounds: fixed },
