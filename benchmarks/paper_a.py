@@ -34,7 +34,7 @@ def main() -> None:
     sections: dict[str, Callable[[], tuple[str, str]]] = {
         "memory": lambda: (paper_a_memory.memory(), ""),  # first, before anything else has used some
         "tables": lambda: (paper_a_tables.tables_1_to_3(cases, options.iterations), paper_a_tables.NOTE),
-        "windows": lambda: (paper_a_tables.table_4(), paper_a_tables.NOTE),
+        "windows": lambda: (paper_a_tables.table_4(options.iterations), paper_a_tables.NOTE),
         "noise": lambda: (paper_a_tables.table_5(), paper_a_tables.NOTE),
         "stability": lambda: (paper_a_stability.stability(), ""),
         "speed": lambda: (

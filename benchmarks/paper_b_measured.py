@@ -66,6 +66,22 @@ class Case:
     outside: float
     learned: LearnedHeatFlow
     force_std_W: float
+    values: FloatArray
+
+
+def slice_errors(rig: Rig, case: Case, n_slices: int = 12) -> list[tuple[float, bool, FloatArray, FloatArray]]:
+    """Return, for each of so many equal slices of the record, what a trained network makes of it from its own first sample.
+
+    Each is (hour at which it begins, whether it is held out, RMS per block without and with the learned convection).
+    """
+    edges = np.linspace(0, rig.time_s.size, n_slices + 1).round().astype(int)
+    found = []
+    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = rig.part(start, stop)
+        bare, curved = (_rms(part, open_loop(part, case.values, c)) for c in ((), case.learned.polynomials))
+        begin_h = float(part.time_s[0] - rig.time_s[0]) / 3600.0
+        found.append((begin_h, begin_h >= case.train_h - 1e-6, bare, curved))
+    return found
 
 
 def load(folder: Path) -> Rig:
@@ -156,7 +172,9 @@ def run_cases(rig: Rig, hours: Sequence[float]) -> list[Case]:
                 bare, curved = (open_loop(part, values, curves) for curves in ((), learned.polynomials))
                 told = [c.predict(curved[:, k], part.ambient).outside for k, c in enumerate(learned.polynomials)]
                 errors = _rms(part, bare), _rms(part, curved)
-                cases.append(Case(name, train_h, where, *errors, float(np.mean(told)), learned, fit.named()["std"]))
+                cases.append(
+                    Case(name, train_h, where, *errors, float(np.mean(told)), learned, fit.named()["std"], values)
+                )
     return cases
 
 

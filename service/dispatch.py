@@ -9,6 +9,7 @@ import time
 from collections import defaultdict
 from typing import Any
 
+from service.fleet.ownership import Ownership
 from service.instants import now_us
 from service.store import webhooks
 from service.store.database import Database
@@ -38,9 +39,9 @@ def pause_s(attempts: int) -> float:
 class Dispatch:
     """Looks for deliveries and sends them; one that waits long holds up only others of its webhook."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, ownership: Ownership) -> None:
         """Begin at once."""
-        self._database = database
+        self._database, self._ownership = database, ownership
         self._http: Any = None
         self._task = asyncio.create_task(self._run())
 
@@ -55,7 +56,7 @@ class Dispatch:
     async def _run(self) -> None:
         while True:
             try:
-                found = await self._database.read(webhooks.due, AT_ONCE)
+                found = await self._database.read(webhooks.due, AT_ONCE) if self._ownership.leads else []
                 if found:
                     await self._send_all(found)
             except Exception as error:  # such as a full disk: what waits goes on waiting

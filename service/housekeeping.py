@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 
 from service.errors import Refusal
+from service.fleet.ownership import Ownership
 from service.store import aside, retention
 from service.store.connection import Connection
 from service.store.database import Database
@@ -18,16 +19,15 @@ CHORES: tuple[tuple[str, Callable[[Connection], int]], ...] = (
     ("deleted samples that can no longer be restored", aside.expire),
     ("twins that were deleted", retention.sweep_gone),
     ("what is older than its twin keeps", retention.sweep_old),
-    ("free pages", retention.vacuum),
 )
 
 
 class Housekeeping:
     """Does the chores at the start, now and then, and when it is woken."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, ownership: Ownership) -> None:
         """Begin at once."""
-        self._database = database
+        self._database, self._ownership = database, ownership
         self._wake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
@@ -44,7 +44,7 @@ class Housekeeping:
     async def _run(self) -> None:
         while True:
             self._wake.clear()
-            for what, chore in CHORES:
+            for what, chore in (*CHORES, *self._database.engine.chores) if self._ownership.leads else ():
                 try:
                     await self._finish(what, chore)
                 except Exception as error:  # the next time may be a better one

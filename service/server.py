@@ -58,7 +58,7 @@ def serve(
 
         load_effects(settings.effect_files)  # what is wrong with one is said before anything starts
     listener = _listen(settings)
-    database = Database(settings.database_path)
+    database = Database(settings.database)
     host, port = listener.getsockname()[:2]
     app = create_app(settings, database, workbench)
     config = uvicorn.Config(

@@ -13,6 +13,7 @@ from service.http.keys import Key, Keys, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
+POSTGRES = ("postgresql://", "postgres://")
 
 
 class SettingsError(TwinError):
@@ -26,7 +27,11 @@ class Settings(BaseSettings):
 
     host: str = Field("127.0.0.1", description="Address to listen on; anything but loopback needs TWIN_API_KEYS.")
     port: int = Field(8000, ge=0, le=65535, description="Port to listen on; 0 picks a free one.")
-    database_url: str = Field("sqlite:///thermal-twin.sqlite3", description="Where everything is stored.")
+    database_url: str = Field(
+        "sqlite:///thermal-twin.sqlite3",
+        repr=False,  # it may hold a password
+        description="Where everything is stored: a SQLite file, or postgresql://… for several processes.",
+    )
     api_keys: SecretStr = Field(SecretStr(""), description="role:key pairs separated by commas.")
     api_keys_file: Path | None = Field(
         None, description="File with a line 'name role key [expires]' per key; read again whenever it changes."
@@ -38,7 +43,17 @@ class Settings(BaseSettings):
     stream_buffer: int = Field(
         20_000, ge=10, description="Messages a slow reader may lag behind before some are dropped."
     )
-    job_workers: int = Field(1, ge=1, le=64, description="Calibrations and diagnoses that run at the same time.")
+    job_workers: int = Field(
+        1,
+        ge=0,
+        le=64,
+        description="Calibrations and diagnoses that this process runs at the same time; 0: others do (`twin worker`).",
+    )
+    executor: str = Field(
+        "process",
+        pattern=r"^(process|dask://[^/]+)$",
+        description="Where jobs compute: `process`, or `dask://HOST:PORT`, the scheduler of a Dask cluster.",
+    )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
     job_values: int = Field(
         250_000,
@@ -75,9 +90,11 @@ class Settings(BaseSettings):
 
     @field_validator("database_url")
     @classmethod
-    def _is_sqlite(cls, value: str) -> str:
+    def _is_known(cls, value: str) -> str:
+        if value.startswith(POSTGRES):
+            return value
         if not value.startswith("sqlite:///") or len(value) <= len("sqlite:///"):
-            raise ValueError("must be sqlite:///FILE (sqlite:////FILE for an absolute path)")
+            raise ValueError("must be sqlite:///FILE (sqlite:////FILE for an absolute path) or postgresql://…")
         if value.removeprefix("sqlite:///").startswith((":memory:", "file:")):
             raise ValueError("must name a file: what is in memory only does not survive, and readers would not see it")
         return value
@@ -115,8 +132,17 @@ class Settings(BaseSettings):
 
     @property
     def database_path(self) -> Path:
-        """The SQLite file."""
+        """The SQLite file; SettingsError if it is a server instead."""
+        if self.database_url.startswith(POSTGRES):
+            raise SettingsError(
+                "TWIN_DATABASE_URL: names a PostgreSQL server; use its own tools there (pg_dump, pg_restore)"
+            )
         return Path(self.database_url.removeprefix("sqlite:///"))
+
+    @property
+    def database(self) -> Path | str:
+        """The SQLite file, or the URL of the PostgreSQL database."""
+        return self.database_url if self.database_url.startswith(POSTGRES) else self.database_path
 
 
 OF_OTHERS = frozenset({"TWIN_API_KEY"})

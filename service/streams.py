@@ -46,11 +46,21 @@ class Topic:
 
     def push(self, stretch: Stretch, most: int) -> None:
         """Take in new messages and forget what lies more than ``most`` numbers back."""
+        if int(stretch.seqs[0]) > self.head + 1:  # another process made messages before: only the store has them
+            self.recent.clear()
+            self.oldest = int(stretch.seqs[0]) - 1
         self.recent.append(stretch)
         self.head = max(self.head, int(stretch.seqs[-1]))
         while self.recent and self.head - int(self.recent[0].seqs[-1]) > most:
             self.oldest = int(self.recent.popleft().seqs[-1])
         self.wake()
+
+    def advance(self, head: int) -> None:
+        """Hear that another process made messages up to a number; readers get them from the store."""
+        if head > self.head:
+            self.head = self.oldest = head
+            self.recent.clear()
+            self.wake()
 
     def wake(self) -> None:
         """Let every reader look again."""
@@ -71,9 +81,11 @@ class Topic:
 class Hub:
     """The streams of all twins."""
 
-    def __init__(self, database: Database, metrics: Metrics, buffer: int) -> None:
-        """Readers may lag ``buffer`` messages behind."""
-        self._database, self._metrics, self._buffer = database, metrics, buffer
+    def __init__(
+        self, database: Database, metrics: Metrics, buffer: int, hint: Callable[[int], None] | None = None
+    ) -> None:
+        """Readers may lag ``buffer`` messages behind; ``hint`` hears of each twin to which something was written."""
+        self._database, self._metrics, self._buffer, self._hint = database, metrics, buffer, hint
         self._loop = asyncio.get_running_loop()
         self._topics: dict[int, Topic] = {}
         self._outcomes: deque[tuple[int, Then[Any], Made[Any], BaseException | None]] = deque()
@@ -89,6 +101,17 @@ class Hub:
             if topic is not None:
                 topic.closed = True
                 topic.wake()
+
+    def head(self, twin: int) -> int:
+        """Return the last number of a twin's stream that was heard of."""
+        topic = self._topics.get(twin)
+        return 0 if topic is None else topic.head
+
+    def advance(self, twin: int, head: int) -> None:
+        """Hear that another process made messages of a twin."""
+        topic = self._topics.get(twin)
+        if topic is not None:
+            topic.advance(head)
 
     def publish(self, twin: int, stretches: Sequence[Stretch]) -> None:
         """Add committed messages; in the event loop, in the order of the commits."""
@@ -116,13 +139,15 @@ class Hub:
         **kwargs: P.kwargs,
     ) -> None:
         """The same, and let somebody hear in the event loop what came of it."""
-        self._database.submit_then(partial(self._after_commit, twin, then), operation, *args, **kwargs)
+        self._database.submit_to(twin, partial(self._after_commit, twin, then), operation, *args, **kwargs)
 
     def _after_commit(self, twin: int, then: Then[Any], made: Made[Any], error: BaseException | None) -> None:
         """Hand an outcome to the event loop; the writer calls this in the order of the commits.
 
         Waking the loop costs as much as a small write, so it is woken once for all that is handed over meanwhile.
         """
+        if self._hint is not None and error is None:
+            self._hint(twin)
         self._outcomes.append((twin, then, made, error))
         if len(self._outcomes) == 1 and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take_outcomes)

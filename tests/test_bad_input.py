@@ -244,7 +244,12 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("calibrate --spec spec.yaml --telemetry data.csv --out no/x.json", "no/x.json: cannot be written"),
     (
         "calibrate --spec spec.yaml --telemetry data.csv --method magic --out x.json",
-        "unknown calibration method 'magic'",
+        "'magic' is not one of 'second-order', 'neural-ode'",
+    ),
+    ("calibrate --spec spec.yaml --telemetry data.csv --epochs 9 --out x.json", "belong to --method neural-ode"),
+    (
+        "calibrate --spec spec.yaml --telemetry data.csv --deadline 0 --out x.json",
+        "'0' is no positive number of seconds",
     ),
     ("calibrate --spec spec.yaml --telemetry data.csv data.csv --out x.json", "data.csv: is named twice"),
     ("calibrate --spec spec.yaml --telemetry data.csv undated.csv --out x.json", "counts seconds, data.csv is dated"),

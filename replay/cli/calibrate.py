@@ -8,7 +8,10 @@ from typing import Any
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.durations import POSITIVE_DURATION
 from replay.cli.effects import effects_option
+
+POSITIVE = click.FloatRange(min=0.0, min_open=True)
 
 
 @click.command(
@@ -25,12 +28,30 @@ from replay.cli.effects import effects_option
     type=FILE,
     help="CSV or MCAP files, one per segment.",
 )
-@click.option("--method", default="second-order", show_default=True, help="How to fit; docs/cli.md lists the methods.")
-@click.option("--loss", default="squared", show_default=True, help="squared, or huber for readings with outliers.")
-@click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option(
-    "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."
+    "--method",
+    default="second-order",
+    show_default=True,
+    type=click.Choice(["second-order", "neural-ode"]),
+    help="How to fit.",
 )
+@click.option(
+    "--loss",
+    default="squared",
+    show_default=True,
+    type=click.Choice(["squared", "huber"]),
+    help="huber for readings with outliers.",
+)
+@click.option("--learning-rate", type=POSITIVE, help="Of neural-ode: Adam's.  [default: 0.01]")
+@click.option("--window", type=POSITIVE_DURATION, help="Of neural-ode: length of a training window.  [default: 2000 s]")
+@click.option("--epochs", type=click.IntRange(min=1), help="Of neural-ode: at most.  [default: 2000]")
+@click.option(
+    "--patience",
+    type=click.IntRange(min=1),
+    help="Of neural-ode: epochs without a lower validation loss until it stops.  [default: 200]",
+)
+@click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
+@click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
 @effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
@@ -39,6 +60,10 @@ def calibrate(
     telemetry: tuple[Path, ...],
     method: str,
     loss: str,
+    learning_rate: float | None,
+    window: float | None,
+    epochs: int | None,
+    patience: int | None,
     no_masking: bool,
     deadline: float | None,
     out: Path,
@@ -53,10 +78,14 @@ def calibrate(
     from twin_core.network.spec_io import load_spec
 
     check_suffix(out, (".json",))
+    given = {"learning_rate": learning_rate, "window_s": window, "max_iterations": epochs, "patience": patience}
+    training = {name: float(value) for name, value in given.items() if value is not None}
+    if training and method != "neural-ode":
+        raise click.UsageError("--learning-rate, --window, --epochs and --patience belong to --method neural-ode")
     spec = load_spec(spec_file)
     records = load_records(telemetry, spec, masking=not no_masking)
     with progress_bar("calibrating") as progress:
-        model = fit(spec, records, method=method, loss=loss, deadline=stop, progress=progress)
+        model = fit(spec, records, method=method, loss=loss, deadline=stop, training=training, progress=progress)
     write_text(out, to_json(model.to_json()))
     notify(model.summary["notices"])
     if as_json:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
-from replay.cli.durations import DURATION
+from replay.cli.durations import DURATION, POSITIVE_DURATION
 from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
@@ -42,9 +42,7 @@ VERDICTS = {
     "--burn-in", type=DURATION, help="First seconds (or 6h, 1d) of each hold-out file that tell its initial state."
 )
 @click.option("--false-alarm-rate", default=0.01, show_default=True, type=float, help="Of findings on healthy records.")
-@click.option(
-    "--deadline", type=click.FloatRange(min=0.0, min_open=True), metavar="S", help="Best answer after so many seconds."
-)
+@click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
 @click.option("--author", default="", help="Who signs the report: printed on it.")

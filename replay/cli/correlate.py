@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
-from replay.cli.durations import DURATION
+from replay.cli.durations import POSITIVE_DURATION
 
 if TYPE_CHECKING:
     from twin_core.calibrate.phases import Phase
@@ -43,7 +43,7 @@ PHASE = "phase"
     help="huber for readings with outliers.",
 )
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
-@click.option("--deadline", type=DURATION, help="Best answer after so many seconds (or 5min).")
+@click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
 @click.option("--author", default="", help="Who signs the report: printed on it.")
 @click.option("--pdf", is_flag=True, help="Print the report too, as report.pdf; needs Chromium or Chrome.")

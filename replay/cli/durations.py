@@ -13,19 +13,30 @@ class Duration(click.ParamType):
 
     name = "duration"
 
+    def __init__(self, *, positive: bool = False) -> None:
+        """Refuse nothing but what is no duration; where ``positive``, none too."""
+        self.positive = positive
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return seconds; a usage error says how to write them."""
-        if isinstance(value, int | float):
-            return float(value)
-        text = str(value).strip().lower()
+        seconds = value if isinstance(value, int | float) else self._parsed(str(value).strip().lower())
+        if seconds is None:
+            self.fail(f"'{value}' is no duration; write seconds, or 30min, 6h, 1d, 1d12h", param, ctx)
+        if self.positive and not 0.0 < seconds < float("inf"):
+            self.fail(f"'{value}' is no positive number of seconds", param, ctx)
+        return float(seconds)
+
+    @staticmethod
+    def _parsed(text: str) -> float | None:
         try:
             return float(text)
         except ValueError:
             pass
         if not re.fullmatch(r"(\d+(\.\d+)?(s|min|m|h|d|w))+", text):
-            self.fail(f"'{value}' is no duration; write seconds, or 30min, 6h, 1d, 1d12h", param, ctx)
+            return None
         parts = re.findall(r"(\d+(?:\.\d+)?)(s|min|m|h|d|w)", text)
         return sum(float(number) * SECONDS[unit] for number, unit in parts)
 
 
 DURATION = Duration()
+POSITIVE_DURATION = Duration(positive=True)

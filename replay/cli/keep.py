@@ -18,7 +18,7 @@ AS_JSON = click.option("--json", "as_json", is_flag=True, help="Print the outcom
 @AS_JSON
 def backup(file: Path, database: Path | None, as_json: bool) -> None:
     """Write a consistent copy of the service's database to FILE, also while it serves, and check it by reading all of it."""
-    from service.store.copies import backup as copy
+    from service.store.sqlite.copies import backup as copy
 
     contents = copy(_file(database), file)
     _say({"file": str(file), **vars(contents)}, f"{file}: {contents.words}, checked", as_json)
@@ -33,7 +33,7 @@ def restore(file: Path, database: Path | None, as_json: bool) -> None:
 
     The former database stays beside it under another name.
     """
-    from service.store.copies import restore as put
+    from service.store.sqlite.copies import restore as put
 
     target = _file(database)
     contents, former = put(file, target)
@@ -50,8 +50,8 @@ def migrate(rehearse: bool, database: Path | None, as_json: bool) -> None:
     """Apply the schema steps that the service would apply at its start; --rehearse tries them on a copy, also while it serves."""
     import tempfile
 
-    from service.store import copies
     from service.store.database import Database
+    from service.store.sqlite import copies
 
     path = _file(database)
     folder = path.resolve().parent
@@ -66,6 +66,33 @@ def migrate(rehearse: bool, database: Path | None, as_json: bool) -> None:
         f"{path}: {words}{tried}, {made.elapsed_s:.1f} s; {made.after.words}, checked",
         as_json,
     )
+
+
+@click.command(
+    "migrate-store",
+    cls=Command,
+    short_help="Move everything to another database.",
+    example="twin migrate-store sqlite:///thermal-twin.sqlite3 postgresql://twin@db/twin",
+)
+@click.argument("source", metavar="FROM")
+@click.argument("target", metavar="TO")
+@AS_JSON
+def migrate_store(source: str, target: str, as_json: bool) -> None:
+    """Copy the database FROM to the empty database TO, both given as for TWIN_DATABASE_URL, and compare checksums.
+
+    The service must not run. FROM stays as it is. A password is best kept in PGPASSWORD or ~/.pgpass.
+    """
+    from replay.cli.console import print_line
+    from service.settings import read_settings
+    from service.store.transfer import transfer
+
+    origin, goal = (read_settings(host="127.0.0.1", database_url=url).database for url in (source, target))
+    moved = transfer(origin, goal)
+    if not as_json:
+        for one in moved:
+            print_line(f"{one.table:18}{one.rows:>12,} rows  {one.sha256[:16]}")
+    rows = sum(one.rows for one in moved)
+    _say({"tables": [vars(one) for one in moved]}, f"{rows:,} rows, checksums agree", as_json)
 
 
 def _file(database: Path | None) -> Path:

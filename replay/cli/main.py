@@ -20,7 +20,7 @@ from replay.cli.demo import demo
 from replay.cli.export import export
 from replay.cli.forecast import forecast
 from replay.cli.import_model import import_model
-from replay.cli.keep import backup, migrate, restore
+from replay.cli.keep import backup, migrate, migrate_store, restore
 from replay.cli.newcomers import check, init, show
 from replay.cli.play import replay
 from replay.cli.printing import print_page
@@ -28,6 +28,7 @@ from replay.cli.record import record
 from replay.cli.register import register
 from replay.cli.serve import serve
 from replay.cli.simulate import simulate
+from replay.cli.worker import worker
 from replay.errors import ReplayError
 from twin_core import __version__
 from twin_core.errors import NoSolutionError, TwinError
@@ -65,7 +66,7 @@ for command in (
         close_loop,
         check_effect,
     ),
-    *(bridge, backup, restore, migrate),
+    *(bridge, backup, restore, migrate, migrate_store, worker),
 ):
     twin.add_command(command)
 

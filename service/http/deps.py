@@ -4,6 +4,7 @@ All of them are coroutines, although none waits: a plain function would be run i
 """
 
 import asyncio
+import contextlib
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -13,6 +14,7 @@ from fastapi.dependencies.models import Dependant
 from starlette.requests import HTTPConnection
 
 from service.errors import short
+from service.fleet.ownership import Ownership
 from service.housekeeping import Housekeeping
 from service.http.keys import Role
 from service.http.problems import Problem
@@ -24,9 +26,9 @@ from service.live.live import Live
 from service.metrics import Metrics
 from service.registry import Entry, Registry
 from service.settings import Settings
-from service.store import retention, twins
+from service.store import ownership, retention, twins
 from service.store.database import Database
-from service.store.errors import TwinGone
+from service.store.errors import Missing, TwinGone
 from service.store.twins import Twin
 from service.streams import Hub
 from twin_core.network.spec import TwinSpec
@@ -45,6 +47,7 @@ class Service:
     intake: Intake
     jobs: Jobs
     housekeeping: Housekeeping
+    ownership: Ownership
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     def add_twin(self, twin: Twin, spec: TwinSpec | None = None) -> Entry:
@@ -53,10 +56,45 @@ class Service:
         if spec is not None:
             entry.know(spec)
         self.hub.open(entry.key, twin.seq)
-        if self.settings.assimilate:
+        if self.settings.assimilate and self.ownership.owns(entry.key):
             self.live.add(entry)
         self.live.arrived(entry)  # what the archive holds and nobody has looked at
         return entry
+
+    async def find(self, name: str) -> Entry:
+        """Return a twin; one that another process registered a moment ago is looked for in the store."""
+        try:
+            return self.registry.get(name)
+        except Missing:
+            if not self.database.is_shared:
+                raise
+        async with self._coming_and_going:
+            return self.add_twin(await self.database.read(twins.get, name))
+
+    async def find_key(self, key: int) -> Entry | None:
+        """Return a twin by its number, None if it is gone."""
+        known = next((entry for entry in self.registry if entry.key == key), None)
+        if known is None and self.database.is_shared:
+            found = await self.database.read(ownership.changes, [key])
+            with contextlib.suppress(Missing):
+                known = await self.find(found[0].name) if found else None
+        return known
+
+    async def forget_twin(self, twin: Entry) -> None:
+        """Let a twin that another process deleted take part in nothing any more."""
+        async with self._coming_and_going:
+            self.registry.remove(twin.name)
+            await self.live.remove(twin)
+            self.hub.close(twin.key)
+
+    async def renew_twin(self, twin: Entry) -> None:
+        """Take over a specification that another process changed; streams end and resume."""
+        async with self._coming_and_going:
+            made = await self.database.read(twins.get, twin.name)
+            await self.live.remove(twin)
+            self.hub.close(twin.key)
+            self.registry.replace(made)
+            self.add_twin(made)
 
     async def register(self, given: Specified) -> tuple[Twin, bool]:
         """Return the twin, and whether it is new; never between the steps of a deletion."""
@@ -70,7 +108,7 @@ class Service:
         async with self._coming_and_going:
             if self.registry.get(twin.name) is not twin:
                 raise TwinGone(f"twin {twin.key} is gone")
-            made, is_new = await self.database.write(twins.revise, twin.name, given.data)
+            made, is_new = await self.database.write_to(twin.key, twins.revise, twin.name, given.data)
             if is_new:
                 await self.live.remove(twin)
                 self.hub.close(twin.key)
@@ -78,7 +116,7 @@ class Service:
                 entry.know(given.spec)
                 left = int(entry.sensors != twin.sensors)
                 while left:
-                    left = await self.database.write(retention.forget_derived, twin.key)
+                    left = await self.database.write_to(twin.key, retention.forget_derived, twin.key)
                 self.add_twin(made)
                 news = [("twin", {"revision": made.revision})]
                 await self.hub.write(twin.key, outcome.tell, twin.key, news)
@@ -92,7 +130,7 @@ class Service:
             self.registry.remove(twin.name)
             await self.jobs.cancel_twin(twin)
             await self.live.remove(twin)
-            await self.database.write(twins.delete, twin.name)
+            await self.database.write_to(twin.key, twins.delete, twin.name)
             self.hub.close(twin.key)
             self.housekeeping.wake()
 
@@ -153,7 +191,7 @@ TwinName = Annotated[str, Path(description="Id of a registered twin.")]
 
 async def named_twin(service: Running, twin: TwinName) -> Entry:
     """Return the twin that the path names (404 if there is none)."""
-    return service.registry.get(twin)
+    return await service.find(twin)
 
 
 NamedTwin = Annotated[Entry, Depends(named_twin)]

@@ -15,7 +15,7 @@ from starlette.routing import Match, Mount
 from starlette.types import Receive, Scope, Send
 
 from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, Refusal, short
-from service.store.errors import Conflicting, DiskFull, Missing, TwinGone
+from service.store.errors import Conflicting, DiskFull, Missing, TwinGone, Unavailable
 from twin_core.errors import TwinError
 
 _LONG = re.compile(rf"[^\s']{{{LONGEST_NAME + 1},}}")
@@ -36,7 +36,7 @@ class Problem(Refusal):
         self.status = status
 
 
-STATUS: Mapping[type[Refusal], int] = {BadField: 422, Missing: 404, Conflicting: 409, DiskFull: 507}
+STATUS: Mapping[type[Refusal], int] = {BadField: 422, Missing: 404, Conflicting: 409, DiskFull: 507, Unavailable: 503}
 """What each refusal is in HTTP."""
 
 

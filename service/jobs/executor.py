@@ -19,7 +19,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from twin_core.errors import TwinError
 
@@ -45,6 +45,10 @@ class JobCancelled(Exception):
     """A task was cancelled while it ran."""
 
 
+class ExecutorLost(Exception):
+    """What computes went away with the task, which is as it was: it may be started again."""
+
+
 class Cancel:
     """A request to end a task, given from any thread."""
 
@@ -60,6 +64,23 @@ class Cancel:
     def requested(self) -> bool:
         """Whether the task shall end."""
         return self._event.is_set()
+
+
+class Tasks(Protocol):
+    """What computes tasks, here or elsewhere."""
+
+    def start(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> "Future[T]":
+        """Queue ``function(*args, progress=..., **kwargs)``; JobFailed, JobCancelled or ExecutorLost say how else it ended."""
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End every task."""
 
 
 class ProcessPerTask(Executor):

@@ -26,6 +26,8 @@ class Finished:
     activate: bool | None
     part: str = ""
     """Which part of the archive it looked at, in words; empty: all."""
+    held: jobs.Claim | None = None
+    """Without it in hand nothing is stored; None for a model that no job made."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,8 @@ class Decision:
 
 def save(connection: Connection, twin: int, finished: Finished) -> tuple[int | None, Sequence[Stretch]]:
     """Store version, activation and result in one transaction; return the version that is active now if it changed."""
+    if finished.held is not None:
+        jobs.hold(connection, finished.held)
     if finished.kind == "diagnosis" and not (finished.outcome.report or {}).get("findings"):
         return None, _end(connection, twin, finished, None, Decision(False, "nothing was found to add"))
     version = models.add(connection, twin, finished.kind, _summary(finished), finished.outcome.document)

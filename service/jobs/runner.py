@@ -1,10 +1,13 @@
 """Runs calibrations and diagnoses: queue, progress, cancel, outcome."""
 
 import asyncio
+import contextlib
 import logging
+import os
+import socket
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +17,14 @@ from service.errors import Refusal
 from service.http.problems import Problem
 from service.instants import parse_instant
 from service.jobs import outcome
-from service.jobs.executor import Cancel, JobCancelled, JobFailed, ProcessPerTask
+from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Tasks
 from service.jobs.outcome import Finished
 from service.metrics import Metrics
 from service.registry import Entry
 from service.store import jobs, models, selection
 from service.store.database import Database
-from service.store.jobs import JobRow
+from service.store.errors import LeaseLost
+from service.store.jobs import Claim, JobRow
 from service.store.models import Active
 from service.store.samples import Samples
 from service.store.selection import Selection
@@ -38,21 +42,29 @@ LEAST_VALIDATION = 20
 LEAST_SAMPLES = 20
 MOST_WAITING = 16
 """Most jobs of one twin that may be queued or running."""
+LEASE_S, BEAT_S = 20.0, 4.0
+"""A worker says that it lives every BEAT_S; one that has not for LEASE_S is taken for dead."""
+LOOK_EVERY_S = 1.0
+"""How often an idle worker looks for jobs that others queued."""
+MOST_ATTEMPTS = 3
+"""A job of which so many workers died is not tried again."""
+CANCEL_S = 15.0
+"""How long a request to cancel waits for a worker elsewhere."""
 
 Json = dict[str, Any]
 
 
 @dataclass
 class _Running:
-    """A job that has not ended."""
+    """A job that this process does."""
 
-    twin: int
+    held: Claim
     cancel: Cancel
     task: "asyncio.Task[None] | None" = None
 
 
 class Jobs:
-    """The jobs of this service."""
+    """The jobs of all twins, those of them that this process does, and the queue from which it takes them."""
 
     def __init__(
         self,
@@ -60,41 +72,56 @@ class Jobs:
         hub: Hub,
         metrics: Metrics,
         workbench: MakeWorkbench,
-        executor: ProcessPerTask,
+        executor: Tasks,
         workers: int,
         job_values: int,
         on_model: Callable[[int], None],
+        find: Callable[[int], Awaitable[Entry | None]],
     ) -> None:
-        """Run at most ``workers`` jobs at a time in an executor; a job takes ``job_values`` values unless asked for more.
+        """Do at most ``workers`` jobs at a time in an executor; a job takes ``job_values`` values unless asked for more.
 
-        ``on_model`` hears of every twin whose active model changed.
+        ``on_model`` hears of every twin whose active model changed; ``find`` returns a twin by its number.
         """
         self._database, self._hub, self._metrics = database, hub, metrics
-        self._workbench, self._on_model = workbench, on_model
+        self._workbench, self._on_model, self._find = workbench, on_model, find
         self._executor, self._job_values = executor, job_values
+        self._name = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:6]}"
         self._free = asyncio.Semaphore(workers)
         self._running: dict[str, _Running] = {}
+        self._wake = asyncio.Event()
+        self._is_closing = False
+        self._tasks = [asyncio.create_task(self._claim_forever())] if workers else []
+        self._tasks.append(asyncio.create_task(self._beat_forever()))
 
     async def start(self, twin: Entry, kind: str, request: Json) -> JobRow:
         """Queue a job and return it; Problem 429 if too many wait already."""
-        if sum(running.twin == twin.key for running in self._running.values()) >= MOST_WAITING:
+        if await self._database.read(jobs.waiting, twin.key) >= MOST_WAITING:
             raise Problem(429, f"{MOST_WAITING} jobs of '{twin.name}' have not ended yet; wait for them or cancel some")
         job = uuid.uuid4().hex[:12]
-        row = await self._database.write(jobs.create, twin.key, job, kind, request)
-        running = _Running(twin.key, Cancel())
-        self._running[job] = running
-        running.task = asyncio.create_task(self._run(twin, row, request, running.cancel))
+        row = await self._database.write_to(twin.key, jobs.create, twin.key, job, kind, request)
+        self._wake.set()
         return row
 
     async def cancel(self, twin: Entry, kind: str, job: str) -> JobRow:
         """End a job and return it; a job that has ended stays as it is."""
         row = await self._database.read(jobs.get, twin.key, kind, job)
+        if row.state == "queued":
+            change = (jobs.finish_waiting, job)
+            await self._hub.write(twin.key, outcome.announce, twin.key, kind, job, *change)
+            row = await self._database.read(jobs.get, twin.key, kind, job)
+            if row.state == "cancelled":
+                self._metrics.jobs.labels(kind, row.state).inc()
         running = self._running.get(job)
         if running is not None and running.task is not None:
             running.cancel.request()
             await asyncio.wait([running.task])
-            row = await self._database.read(jobs.get, twin.key, kind, job)
-        return row
+        elif row.state == "running":
+            await self._database.write(jobs.ask_to_cancel, job)
+            until_s = time.monotonic() + CANCEL_S
+            while row.state == "running" and time.monotonic() < until_s:
+                await asyncio.sleep(0.1)
+                row = await self._database.read(jobs.get, twin.key, kind, job)
+        return await self._database.read(jobs.get, twin.key, kind, job)
 
     async def cancel_twin(self, twin: Entry) -> None:
         """End every job of a twin that is about to go."""
@@ -103,76 +130,116 @@ class Jobs:
                 if row.state in ("queued", "running"):
                     await self.cancel(twin, kind, row.id)
 
-    def busy(self, twin: Entry) -> bool:
-        """Return whether a job of this twin is queued or running."""
-        return any(running.twin == twin.key for running in self._running.values())
+    async def busy(self, twin: Entry) -> bool:
+        """Return whether a job of this twin is queued or running, wherever."""
+        return await self._database.read(jobs.waiting, twin.key) > 0
 
     async def close(self) -> None:
-        """End every job; each is marked as it ends."""
+        """Claim nothing more and end every job of this process; each is marked as it ends, or waits for another one."""
+        self._is_closing = True
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.wait(self._tasks)
         for running in self._running.values():
             running.cancel.request()
         tasks = [running.task for running in self._running.values() if running.task is not None]
         if tasks:
             await asyncio.wait(tasks)
+        with contextlib.suppress(Refusal):
+            await self._database.write(jobs.leave, self._name, is_shared=self._database.is_shared)
         await asyncio.to_thread(self._executor.shutdown)
 
-    async def _run(self, twin: Entry, row: JobRow, request: Json, cancel: Cancel) -> None:
-        state, message = "failed", ""
-        try:
-            await self._wait_for_turn(cancel)
+    async def _claim_forever(self) -> None:
+        """Take jobs as long as there are some and a worker is free; then wait for a word, and look now and then."""
+        while True:
+            await self._free.acquire()
+            held = None
             try:
-                self._metrics.jobs_running.inc()
-                await self._work(twin, row, request, cancel)
-                state = "succeeded"
-            finally:
-                self._metrics.jobs_running.dec()
-                self._free.release()
+                claiming = (self._name, round(1e6 * LEASE_S))
+                held = await self._database.write(jobs.claim, *claiming, is_shared=self._database.is_shared)
+            except Exception as error:  # such as a database that is away: the queue stays as it is
+                log.warning("no job can be claimed", extra={"reason": f"{type(error).__name__}: {error}"})
+            if held is not None:
+                running = self._running[held.job] = _Running(held, Cancel())
+                running.task = asyncio.create_task(self._run(running))
+                continue
+            self._free.release()
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LOOK_EVERY_S):
+                    await self._wake.wait()
+
+    async def _beat_forever(self) -> None:
+        """Say that this worker lives; let go of jobs that are in other hands, and end those that somebody cancelled."""
+        while True:
+            await asyncio.sleep(BEAT_S)
+            if not self._running or not self._database.is_shared:
+                continue
+            known = list(self._running.items())
+            try:
+                held = await self._database.write(jobs.beat, self._name)
+            except Exception as error:
+                log.warning("no word of the jobs can be sent", extra={"reason": f"{type(error).__name__}: {error}"})
+                continue
+            for job, running in known:
+                attempt, cancel = held.get(job, (-1, True))
+                if cancel or attempt != running.held.attempt:
+                    running.cancel.request()
+
+    async def _run(self, running: _Running) -> None:
+        held, cancel = running.held, running.cancel
+        state, message = "failed", ""
+        self._metrics.jobs_running.inc()
+        try:
+            twin = await self._find(held.twin)
+            if twin is None:
+                return
+            if held.attempt > MOST_ATTEMPTS:
+                raise JobFailed(f"its worker died {MOST_ATTEMPTS} times; take fewer samples, or look at the log")
+            await self._work(twin, held, cancel)
+            state = "succeeded"
         except JobCancelled:
-            state, message = "cancelled", "cancelled"
+            given_up = self._is_closing and self._database.is_shared  # another process goes on with it
+            state, message = ("queued", "") if given_up else ("cancelled", "cancelled")
+        except LeaseLost:
+            state = "lost"
+            log.warning("a job is in other hands now", extra={"job": held.job, "attempt": held.attempt})
+        except ExecutorLost as error:
+            state = "queued"
+            log.warning("what computes is away; the job waits", extra={"job": held.job, "reason": str(error)})
         except (JobFailed, Refusal) as error:
             message = error.detail if isinstance(error, Refusal) else str(error)
             if isinstance(error, JobFailed) and error.trace is not None:
-                log.error("a job met a defect", extra={"job": row.id, "kind": row.kind, "trace": error.trace})
+                log.error("a job met a defect", extra={"job": held.job, "kind": held.kind, "trace": error.trace})
         except Exception as error:
             message = f"{type(error).__name__}: {error}"
-            log.exception("a job failed unexpectedly", extra={"job": row.id, "kind": row.kind})
+            log.exception("a job failed unexpectedly", extra={"job": held.job, "kind": held.kind})
         finally:
-            self._running.pop(row.id, None)
-        self._metrics.jobs.labels(row.kind, state).inc()
-        if state != "succeeded":
-            await self._end(twin, row, state, message)
+            self._running.pop(held.job, None)
+            self._metrics.jobs_running.dec()
+            self._free.release()
+        self._metrics.jobs.labels(held.kind, state).inc()
+        if state not in ("succeeded", "lost"):
+            await self._end(held, state, message)
 
-    async def _wait_for_turn(self, cancel: Cancel) -> None:
-        """Return once a worker is free."""
-        while True:
-            if cancel.requested:
-                raise JobCancelled
-            try:
-                async with asyncio.timeout(0.1):
-                    await self._free.acquire()
-                    return
-            except TimeoutError:
-                continue
-
-    async def _end(self, twin: Entry, row: JobRow, state: str, message: str) -> None:
-        change = (jobs.finish, row.id, state, message)
+    async def _end(self, held: Claim, state: str, message: str) -> None:
+        change = (jobs.put_back, held) if state == "queued" else (jobs.end, held, state, message)
         try:
-            await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
-        except (LookupError, Refusal):
-            log.info("a job ended after its twin was deleted", extra={"job": row.id})
+            await self._hub.write(held.twin, outcome.announce, held.twin, held.kind, held.job, *change)
+        except (LookupError, Refusal, LeaseLost):
+            log.info("a job ended after its twin was deleted, or in other hands", extra={"job": held.job})
 
-    async def _work(self, twin: Entry, row: JobRow, request: Json, cancel: Cancel) -> None:
+    async def _work(self, twin: Entry, held: Claim, cancel: Cancel) -> None:
         """Do a job whose turn it is."""
-        await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, jobs.begin, row.id)
+        request = held.request
+        await self._say(held, 0.0, "starting")
         chosen = await self.choose(twin, request)
         if chosen.words:
-            change = (jobs.report, row.id, 0.0, f"takes {chosen.words}")
-            await self._hub.write(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
+            await self._say(held, 0.0, f"takes {chosen.words}")
         telemetry = _telemetry(twin, chosen.samples)
         active = await self._database.read(models.active, twin.key)
-        task, function = self._task(twin, row.kind, request, telemetry, active)
-        progress = self._reporter(twin, row)
-        future = self._executor.start(work, (self._workbench, function, task), {}, progress, cancel)
+        task, function = self._task(twin, held.kind, request, telemetry, active)
+        future = self._executor.start(work, (self._workbench, function, task), {}, self._reporter(held), cancel)
         made = await asyncio.wrap_future(future)
         provenance = {
             "data_sha256": telemetry.sha256(),
@@ -183,9 +250,14 @@ class Jobs:
             "parent": None if active is None else active.version,
         }
         rival = None if active is None else active.version
-        finished = Finished(row.id, row.kind, made, provenance, rival, _wish(row, request), chosen.words)
+        wish = _wish(held.kind, request)
+        finished = Finished(held.job, held.kind, made, provenance, rival, wish, chosen.words, held)
         if await self._hub.write(twin.key, outcome.save, twin.key, finished) is not None:
             self._on_model(twin.key)
+
+    async def _say(self, held: Claim, progress: float, message: str) -> None:
+        change = (jobs.report, held, progress, message)
+        await self._hub.write(held.twin, outcome.announce, held.twin, held.kind, held.job, *change)
 
     def _task(
         self, twin: Entry, kind: str, request: Json, telemetry: Telemetry, active: Active | None
@@ -217,7 +289,7 @@ class Jobs:
             raise Problem(422, f"the archive holds {held} samples there, {LEAST_SAMPLES} are needed")
         return chosen
 
-    def _reporter(self, twin: Entry, row: JobRow) -> Callable[[float, str], None]:
+    def _reporter(self, held: Claim) -> Callable[[float, str], None]:
         """Return a progress callback for worker threads that writes now and then."""
         last_s = 0.0
 
@@ -226,8 +298,8 @@ class Jobs:
             now_s = time.monotonic()
             if now_s - last_s >= REPORT_EVERY_S or fraction >= 1.0:
                 last_s = now_s
-                change = (jobs.report, row.id, min(max(fraction, 0.0), 1.0), message)
-                self._hub.submit(twin.key, outcome.announce, twin.key, row.kind, row.id, *change)
+                change = (jobs.report, held, min(max(fraction, 0.0), 1.0), message)
+                self._hub.submit(held.twin, outcome.announce, held.twin, held.kind, held.job, *change)
 
         return report
 
@@ -239,10 +311,10 @@ def _telemetry(twin: Entry, found: Samples) -> Telemetry:
     return Telemetry(int(found.time_us[0]), found.time_us, present)
 
 
-def _wish(row: JobRow, request: Json) -> bool | None:
+def _wish(kind: str, request: Json) -> bool | None:
     """Return whether the caller wants the new model active: True, False, or None for 'if it is the better one'."""
     wish = request["activate"]
-    if row.kind == "diagnosis":
+    if kind == "diagnosis":
         return bool(wish)
     return None if wish is None else bool(wish)
 

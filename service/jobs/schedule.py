@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.errors import Refusal
+from service.fleet.ownership import Ownership
 from service.instants import now_us
 from service.jobs.runner import LEAST_SAMPLES, Jobs
 from service.registry import Entry, Registry
@@ -71,6 +72,7 @@ class Schedule:
         patience_s: float,
         refutation_rate: float,
         evidence: Callable[[Entry], float | None],
+        ownership: Ownership,
     ) -> None:
         """Begin to look; ``every_s`` None, ``patience_s`` 0 and ``refutation_rate`` 0 switch the triggers off.
 
@@ -79,6 +81,7 @@ class Schedule:
         self._database, self._registry, self._jobs = database, registry, jobs
         self._every_s, self._patience_s = every_s, patience_s
         self._refutation_rate, self._evidence = refutation_rate, evidence
+        self._ownership = ownership
         self._watches: dict[int, Watch] = {}
         self._task = asyncio.create_task(self._run())
 
@@ -93,6 +96,9 @@ class Schedule:
             await asyncio.sleep(TICK_S)
             refuted = self._refuted()
             for twin in self._registry:
+                if not self._ownership.owns(twin.key):
+                    self._watches.pop(twin.key, None)
+                    continue
                 try:
                     await self._look(twin, time.monotonic(), twin.key in refuted)
                 except Refusal as error:
@@ -113,11 +119,11 @@ class Schedule:
             triggers.append("schedule")
         if watch.due_by_anomaly(now_s, self._patience_s, open_ids):
             triggers.append("anomaly")
-        if triggers and head.samples >= LEAST_SAMPLES and not self._jobs.busy(twin):
+        if triggers and head.samples >= LEAST_SAMPLES and not await self._jobs.busy(twin):
             watch.calibrated_s, watch.samples = now_s, head.samples
             request = CalibrationRequest().model_dump(mode="json") | {"trigger": triggers[-1]}
             await self._start(twin, "calibration", request)
-        if watch.due_by_refutation(now_s, self._patience_s, is_refuted) and not self._jobs.busy(twin):
+        if watch.due_by_refutation(now_s, self._patience_s, is_refuted) and not await self._jobs.busy(twin):
             watch.refuted_s = None
             if not await self._database.read(jobs.asked_since_activation, twin.key, "diagnosis"):
                 request = DiagnosisRequest().model_dump(mode="json") | {"trigger": "refuted"}

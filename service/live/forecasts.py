@@ -10,9 +10,9 @@ from service.errors import BadField, short
 from service.http.problems import Problem
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
+from service.live.known import Known
 from service.live.position import Position
 from service.live.pulse import Beat
-from service.live.tracker import Tracker
 from service.registry import Entry
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
@@ -33,7 +33,7 @@ NEEDED = (0.05, 0.5, 0.95)
 Json = dict[str, Any]
 
 
-async def state_of(tracker: Tracker) -> tuple[Active, Position]:
+async def state_of(tracker: Known) -> tuple[Active, Position]:
     """Return the active model and its present state; Problem 409 if there is none."""
     settled = await tracker.settled(SETTLE_S)
     if tracker.active is None:
@@ -150,7 +150,7 @@ class Look:
     made: Forecasted
 
 
-async def look_ahead(tracker: Tracker, database: Database, engine: Engine, request: ForecastRequest) -> Look:
+async def look_ahead(tracker: Known, database: Database, engine: Engine, request: ForecastRequest) -> Look:
     """Forecast from the present state; Problem if there is none, or if the request asks for too much."""
     active, position = await state_of(tracker)
     lag = await behind(tracker, database)
@@ -172,7 +172,7 @@ class Behind:
     quarantined: int
 
 
-async def behind(tracker: Tracker, database: Database) -> Behind:
+async def behind(tracker: Known, database: Database) -> Behind:
     """Return how far the state of a twin is behind the last sample; one that waits for company does not count."""
     head = await database.read(twins.get, tracker.twin.name)
     position, last_us = tracker.position, head.last_us
@@ -185,7 +185,7 @@ async def behind(tracker: Tracker, database: Database) -> Behind:
     return Behind(lag_us / 1e6, max(of - tracker.left, 0), of, head.quarantined)
 
 
-def notices(tracker: Tracker, position: Position, lag: Behind, silent_s: float | None) -> list[str]:
+def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | None) -> list[str]:
     """Say where a forecast begins, if that is not the present or is known less well than it will be.
 
     ``silent_s`` is for how long no sensor has been heard of; None while one is.

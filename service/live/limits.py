@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.errors import Refusal
+from service.fleet.ownership import Ownership
 from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
@@ -19,7 +20,7 @@ from service.store import alarms, events, samples
 from service.store.alarms import AlarmRow, Limit
 from service.store.connection import Connection
 from service.store.database import Database
-from service.store.errors import TwinGone
+from service.store.errors import LeaseLost, TwinGone
 from service.store.samples import Samples
 from service.streams import Hub
 from service.workbench import Forecasted
@@ -65,10 +66,11 @@ class LimitWatch:
         engine: Engine,
         find: Callable[[int], Tracker | None],
         horizon_s: float,
+        ownership: Ownership,
     ) -> None:
         """Look ``horizon_s`` ahead; 0: not at all."""
         self._database, self._hub, self._engine, self._find = database, hub, engine, find
-        self._horizon_s = horizon_s
+        self._horizon_s, self._ownership = horizon_s, ownership
         self._loop = asyncio.get_running_loop()
         self._due: dict[int, Entry] = {}
         self._foreseen_s: dict[int, float] = {}
@@ -77,7 +79,7 @@ class LimitWatch:
 
     def arrived(self, twin: Entry) -> None:
         """Hear that samples were stored, or taken away."""
-        if limits_of(twin, MEASURED):
+        if self._ownership.owns(twin.key) and limits_of(twin, MEASURED):
             self._due[twin.key] = twin
             self._wake.set()
 
@@ -98,9 +100,9 @@ class LimitWatch:
             due, self._due = self._due, {}
             for twin in due.values():
                 try:
-                    await self._hub.write(twin.key, look, twin)
+                    await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
                     await self._foresee(twin)
-                except TwinGone:
+                except (TwinGone, LeaseLost):
                     continue
                 except Exception:
                     log.exception("limits could not be watched", extra={"twin": twin.name})
@@ -123,7 +125,9 @@ class LimitWatch:
         except (Refusal, TwinError):
             self._foreseen_s.pop(twin.key, None)
             return  # there is no state yet
-        await self._hub.write(twin.key, foresee, twin, limits, found.position.time_us, found.made)
+        await self._hub.write(
+            twin.key, self._ownership.guard(twin.key)(foresee), twin, limits, found.position.time_us, found.made
+        )
 
 
 def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:

@@ -2,9 +2,11 @@
 
 import copy
 
+from service.fleet.ownership import Ownership
 from service.http.problems import Problem
 from service.live import pulse as pulses
 from service.live.engine import Engine
+from service.live.known import Known, Stored
 from service.live.limits import LimitWatch
 from service.live.pulse import Beat, Pulse
 from service.live.scores import Scores
@@ -29,22 +31,32 @@ class Live:
         false_alarm_rate: float,
         limit_horizon_s: float,
         window: int,
+        ownership: Ownership,
     ) -> None:
         """Start without twins; a new model follows at most the newest ``window`` samples of the past."""
-        self._window = window
+        self._window, self._ownership = window, ownership
         self.engine = Engine(workbench)
         self._database, self._hub, self._metrics = database, hub, metrics
+        self._follows_elsewhere = database.is_shared
         self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
         self._pulses: dict[int, Pulse] = {}
         self.scores = Scores(database, self.engine)
-        self._limits = LimitWatch(database, hub, self.engine, self.find, limit_horizon_s)
+        self._limits = LimitWatch(database, hub, self.engine, self.find, limit_horizon_s, ownership)
 
     def add(self, twin: Entry) -> None:
         """Begin to track a twin."""
         if twin.key not in self._trackers:
             rooms = (self._database, self._hub, self.engine, self._metrics)
-            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds, self._window)
+            guard = self._ownership.guard(twin.key)
+            self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds, self._window, guard)
+
+    async def let_go(self, twin: Entry) -> None:
+        """Stop following a twin, which another process does now."""
+        self._limits.forget(twin)
+        tracker = self._trackers.pop(twin.key, None)
+        if tracker is not None:
+            await tracker.close()
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""
@@ -55,9 +67,14 @@ class Live:
         if tracker is not None:
             await tracker.close()
 
-    def tracker(self, twin: Entry) -> Tracker:
-        """Return the tracker of a twin; Problem 409 if nothing follows its samples."""
+    def state(self, twin: Entry) -> Known:
+        """Return what is known of the state of a twin; Problem 409 if nothing follows its samples.
+
+        Where another process follows them, that is what it has written down.
+        """
         tracker = self._trackers.get(twin.key)
+        if tracker is None and self._follows_elsewhere and not self._ownership.owns(twin.key):
+            return Stored(twin, self._database)
         if tracker is None:
             raise Problem(
                 409, f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted"

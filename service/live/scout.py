@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.errors import Refusal
+from service.fleet.ownership import Guard
 from service.live.caution import Caution
 from service.live.following import Following
 from service.live.position import Position, is_far, next_count
@@ -46,10 +47,12 @@ class Base:
 class Scout:
     """Follows the newest samples of a twin with its active model."""
 
-    def __init__(self, twin: Entry, database: Database, hub: Hub, following: Following, active: Active) -> None:
+    def __init__(
+        self, twin: Entry, database: Database, hub: Hub, following: Following, active: Active, guard: Guard
+    ) -> None:
         """Know nothing yet: ``begin`` or ``seed`` it."""
         self._twin, self._database, self._hub, self._following = twin, database, hub, following
-        self._active = active
+        self._active, self._guard = active, guard
         self._caution = Caution()
         self._before: Position | None = None
         self._after_us = 0
@@ -114,7 +117,7 @@ class Scout:
         position, step = self._following.step(
             self._active, before, after_us, done, 0, told[: fresh.time_us.size], revision, is_provisional=True
         )
-        await self._hub.write(self._twin.key, save, self._twin, step)
+        await self._hub.write(self._twin.key, self._guard(save), self._twin, step)
         self.position = self._before = position
         self._after_us = position.time_us
         return True

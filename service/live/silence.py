@@ -5,11 +5,12 @@ import contextlib
 import logging
 from collections.abc import Sequence
 
+from service.fleet.ownership import Alone, Ownership
 from service.instants import in_words, now_us
 from service.jobs import outcome
 from service.live.live import Live
 from service.registry import Entry, Registry
-from service.store.errors import TwinGone
+from service.store.errors import LeaseLost, TwinGone
 from service.streams import Hub
 
 log = logging.getLogger("service.live")
@@ -20,8 +21,9 @@ LOOK_EVERY_S = 10.0
 class Silence:
     """Looks at every twin now and then; after a start it tells of what is silent then."""
 
-    def __init__(self, registry: Registry, live: Live, hub: Hub) -> None:
+    def __init__(self, registry: Registry, live: Live, hub: Hub, ownership: Ownership | None = None) -> None:
         """Begin at once."""
+        self._ownership = ownership or Alone()
         self._registry, self._live, self._hub = registry, live, hub
         self._silent: dict[int, frozenset[str]] = {}
         self._task = asyncio.create_task(self._run())
@@ -36,9 +38,12 @@ class Silence:
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
             for twin in self._registry:
+                if not self._ownership.owns(twin.key):
+                    self._silent.pop(twin.key, None)
+                    continue
                 try:
                     await self.look(twin)
-                except TwinGone:
+                except (TwinGone, LeaseLost):
                     self._silent.pop(twin.key, None)
                 except Exception:
                     log.exception("nobody can tell which sensors are silent", extra={"twin": twin.name})
@@ -58,7 +63,7 @@ class Silence:
         if back := sorted(before - silent):
             messages.append(("stale", {"state": "live", "channels": back, "text": f"{_listed(back)} reports again"}))
         if messages:
-            await self._hub.write(twin.key, outcome.tell, twin.key, messages)
+            await self._hub.write(twin.key, self._ownership.guard(twin.key)(outcome.tell), twin.key, messages)
 
 
 def _listed(names: Sequence[str]) -> str:

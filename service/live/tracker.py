@@ -5,6 +5,7 @@ import logging
 from dataclasses import dataclass, replace
 
 from service.errors import Refusal
+from service.fleet.ownership import Guard
 from service.instants import format_instant
 from service.live import progress
 from service.live.caution import Caution, Rest
@@ -17,7 +18,7 @@ from service.metrics import Metrics
 from service.registry import Entry
 from service.store import models
 from service.store.database import Database
-from service.store.errors import TwinGone
+from service.store.errors import LeaseLost, TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.streams import Hub
@@ -63,8 +64,9 @@ class Tracker:
         metrics: Metrics,
         thresholds: Thresholds,
         window: int,
+        guard: Guard,
     ) -> None:
-        """Start in the background; the state comes from the last checkpoint.
+        """Start in the background; the state comes from the last checkpoint, and is written as long as a guard lets it.
 
         Where a model is to follow more than ``window`` samples of the past, it follows the newest of them only.
         """
@@ -77,7 +79,7 @@ class Tracker:
         """Instant of a lone sample far ahead of the others, which waits for company; None if there is none."""
         self.trouble: str | None = None
         self.catching_up = False
-        self._database, self._hub = database, hub
+        self._database, self._hub, self._guard = database, hub, guard
         self._metrics = metrics
         self._following = Following(twin, database, engine, thresholds)
         self._scout: Scout | None = None
@@ -152,7 +154,7 @@ class Tracker:
             self._wake.clear()
             try:
                 await self._take_in()
-            except TwinGone:
+            except (TwinGone, LeaseLost):
                 return
             except Exception as error:
                 self.trouble = f"{type(error).__name__}: {error}"
@@ -219,7 +221,7 @@ class Tracker:
     async def _lift_floor(self, active: Active, from_us: int) -> None:
         """Leave out of what lies behind an instant all but the newest samples."""
         arguments = (self.twin, active.version, self._window, from_us)
-        self.floor_us = await self._database.write(progress.lift_floor, *arguments)
+        self.floor_us = await self._database.write_to(self.twin.key, self._guard(progress.lift_floor), *arguments)
 
     def _stand(self, position: Position | None) -> None:
         """Go on from a position, up to which the archive was read when the stream stood at its number."""
@@ -290,7 +292,7 @@ class Tracker:
 
     async def _send_scout(self, active: Active) -> Scout:
         """Return a scout that goes on from where the assimilation has been before, or else looks for the present."""
-        scout = Scout(self.twin, self._database, self._hub, self._following, active)
+        scout = Scout(self.twin, self._database, self._hub, self._following, active, self._guard)
         if self._passed is not None:
             scout.seed(self._passed)
         else:
@@ -310,7 +312,7 @@ class Tracker:
         if self._detour is not None:
             until_us = self._detour.until_us
         arguments = (self.twin, active.version, late_us, until_us)
-        checkpoint = await self._database.write(progress.rewind, *arguments)
+        checkpoint = await self._database.write_to(self.twin.key, self._guard(progress.rewind), *arguments)
         if self._detour is None and until_us is not None:
             self._detour = _Detour(until_us, before, self._read, 0 if checkpoint is None else checkpoint.n_samples)
         self._stand(None if checkpoint is None else Position.of(checkpoint))
@@ -322,13 +324,15 @@ class Tracker:
         """
         done, back = self._at, detour.back
         if await self._database.read(progress.outdates_inputs, self.twin, detour.read, detour.until_us):
-            checkpoint = await self._database.write(progress.rewind, self.twin, active.version, detour.until_us, None)
+            checkpoint = await self._database.write_to(
+                self.twin.key, self._guard(progress.rewind), self.twin, active.version, detour.until_us, None
+            )
             self._detour, self._caution = None, Caution()
             self._stand(None if checkpoint is None else Position.of(checkpoint))
             return
         if done is not None:
             arguments = (self.twin, active.version, done.time_us, detour.until_us)
-            await self._hub.write(self.twin.key, progress.end_record, *arguments)
+            await self._hub.write(self.twin.key, self._guard(progress.end_record), *arguments)
             back = replace(back, n_samples=back.n_samples + done.n_samples - detour.n_samples)
         self._detour, self._caution = None, Caution()
         self._stand(back)
@@ -352,7 +356,7 @@ class Tracker:
             time_us > (_EVER if scouted is None else scouted.time_us)
         )
         after, step = self._following.step(active, before, after_us, done, seq, told, reading.revision)
-        await self._hub.write(self.twin.key, progress.save, self.twin, step)
+        await self._hub.write(self.twin.key, self._guard(progress.save), self.twin, step)
         self._metrics.assimilated.inc(int(time_us.size))
         self.left = max(self.left - int(time_us.size), 0)
         self._stand(after)

@@ -87,22 +87,25 @@ def write(
         connection.execute(query, (stop_us, text, known[0]))
         return None if stop_us is None else get(connection, twin, known[0])
     shelved = connection.execute(f"SELECT max(shelved_until_us) FROM alarm {where}", place).fetchone()[0]
-    row = connection.execute(
+    (number,) = connection.execute(
         """INSERT INTO alarm (twin, origin, channel, colour, side, bound, start_us, stop_us, body, shelved_until_us)
-           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)""",
+           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id""",
         (*place, limit.bound, start_us, stop_us, text, shelved if shelved and shelved > now_us() else None),
-    )
+    ).fetchone()
     connection.execute(
         """DELETE FROM alarm WHERE twin = ? AND stop_us IS NOT NULL AND id <=
            (SELECT id FROM alarm WHERE twin = ? ORDER BY id DESC LIMIT 1 OFFSET ?)""",
         (twin, twin, KEPT),
     )
-    return get(connection, twin, int(row.lastrowid or 0))
+    return get(connection, twin, number)
 
 
 def end(connection: Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
     """End an alarm that lasts."""
-    connection.execute("UPDATE alarm SET stop_us = max(start_us, ?) WHERE id = ?", (stop_us, number))
+    connection.execute(
+        "UPDATE alarm SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END WHERE id = ?",
+        (stop_us, stop_us, number),
+    )
     return get(connection, twin, number)
 
 
@@ -157,5 +160,6 @@ def watched(connection: Connection, twin: int) -> tuple[int, Json]:
 
 def watch(connection: Connection, twin: int, seq: int, state: Json) -> None:
     """Note up to where measured limits were watched."""
-    query = "INSERT OR REPLACE INTO watched (twin, seq, state) VALUES (?, ?, ?)"
+    query = """INSERT INTO watched (twin, seq, state) VALUES (?, ?, ?)
+               ON CONFLICT (twin) DO UPDATE SET seq = excluded.seq, state = excluded.state"""
     connection.execute(query, (twin, seq, orjson.dumps(state).decode()))

@@ -79,13 +79,13 @@ def apply(
         if known is None:
             cursor = connection.execute(
                 """INSERT INTO anomaly (twin, version, sensor, kind, start_us, stop_us, score, cause)
-                   VALUES (?, ?, ?, ?, ?, ?, ?, ?)""",
+                   VALUES (?, ?, ?, ?, ?, ?, ?, ?) RETURNING id""",
                 (
                     *(twin, version, change.sensor, change.kind, change.start_us, change.stop_us, change.score),
                     _known_cause(connection, twin, version, change),
                 ),
             )
-            number = int(cursor.lastrowid or 0)
+            number = int(cursor.fetchone()[0])
         else:
             number = known.id
             confirmed.add(number)
@@ -97,7 +97,7 @@ def apply(
             connection.execute(update, (change.start_us, change.stop_us, change.score, number))
         confirmed.add(number)
         news.append(number)
-    kept = ",".join(map(str, confirmed))
+    kept = ",".join(map(str, confirmed or {0}))
     connection.execute(
         f"""DELETE FROM anomaly WHERE twin = ? AND version = ? AND start_us > ? AND start_us <= ?
             AND id NOT IN ({kept})""",
@@ -111,9 +111,12 @@ def apply(
 
 def close(connection: Connection, twin: int, version: int, stop_us: int, until_us: int) -> list[AnomalyRow]:
     """End the intervals that began before ``until_us`` and last: nothing is known of what followed ``stop_us`` there."""
-    query = """UPDATE anomaly SET stop_us = max(start_us, ?) WHERE twin = ? AND version = ? AND stop_us IS NULL
-               AND start_us < ? RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
-    return [AnomalyRow(*row) for row in connection.execute(query, (stop_us, twin, version, until_us)).fetchall()]
+    query = """UPDATE anomaly SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END
+               WHERE twin = ? AND version = ? AND stop_us IS NULL AND start_us < ?
+               RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
+    return [
+        AnomalyRow(*row) for row in connection.execute(query, (stop_us, stop_us, twin, version, until_us)).fetchall()
+    ]
 
 
 def _same(
@@ -202,7 +205,8 @@ def open_ids(connection: Connection, twin: int, version: int | None) -> list[int
 
 def open_kinds(connection: Connection, twin: int, version: int | None) -> dict[str, list[str]]:
     """Return the kinds of anomalies of one model version that last, by sensor."""
-    query = "SELECT DISTINCT sensor, kind FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
+    query = """SELECT sensor, kind FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL
+               GROUP BY sensor, kind ORDER BY min(id)"""
     found: dict[str, list[str]] = {}
     for sensor, kind in connection.execute(query, (twin, version)):
         found.setdefault(sensor, []).append(kind)

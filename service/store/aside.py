@@ -228,10 +228,11 @@ def _note(
     named = None if channels is None else tuple(channels)
     at_us = now_us()
     row = connection.execute(
-        "INSERT INTO deletion (twin, at_us, place, start_us, stop_us, channels, samples) VALUES (?, ?, ?, ?, ?, ?, ?)",
+        """INSERT INTO deletion (twin, at_us, place, start_us, stop_us, channels, samples)
+           VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id""",
         (twin, at_us, place, start_us, stop_us, None if named is None else orjson.dumps(named).decode(), n_samples),
     )
-    return Deletion(int(row.lastrowid or 0), at_us, place, start_us, stop_us, named, n_samples, None)
+    return Deletion(int(row.fetchone()[0]), at_us, place, start_us, stop_us, named, n_samples, None)
 
 
 def _span(start_us: int | None, stop_us: int | None) -> tuple[int, int]:

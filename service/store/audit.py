@@ -14,10 +14,10 @@ def append(
 ) -> None:
     """Write one line."""
     row = connection.execute(
-        "INSERT INTO audit (at_us, who, method, path, status, client, detail) VALUES (?, ?, ?, ?, ?, ?, ?)",
+        "INSERT INTO audit (at_us, who, method, path, status, client, detail) VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id",
         (at_us, who, method, path, status, client, detail),
     )
-    connection.execute("DELETE FROM audit WHERE id <= ?", (int(row.lastrowid or 0) - KEPT,))
+    connection.execute("DELETE FROM audit WHERE id <= ?", (int(row.fetchone()[0]) - KEPT,))
 
 
 def settled(connection: Connection) -> None:

@@ -33,7 +33,8 @@ def put(
     if not keep_previous and len(rows) == 2 and checkpoint.n_samples - rows[1][1] < EVERY:
         _delete(connection, twin, version, [rows[0][0]])
     connection.execute(
-        "INSERT OR REPLACE INTO checkpoint (twin, version, time_us, n, state) VALUES (?, ?, ?, ?, ?)",
+        """INSERT INTO checkpoint (twin, version, time_us, n, state) VALUES (?, ?, ?, ?, ?)
+           ON CONFLICT (twin, version, time_us) DO UPDATE SET n = excluded.n, state = excluded.state""",
         (twin, version, checkpoint.time_us, checkpoint.n_samples, orjson.dumps(checkpoint.body).decode()),
     )
     _thin(connection, twin, version)
@@ -70,7 +71,9 @@ def floor(connection: Connection, twin: int, version: int) -> int | None:
 
 def raise_floor(connection: Connection, twin: int, version: int, at_us: int) -> None:
     """Let a version's assimilation look at nothing before an instant from now on."""
-    connection.execute("INSERT OR REPLACE INTO floor (twin, version, at_us) VALUES (?, ?, ?)", (twin, version, at_us))
+    query = """INSERT INTO floor (twin, version, at_us) VALUES (?, ?, ?)
+               ON CONFLICT (twin, version) DO UPDATE SET at_us = excluded.at_us"""
+    connection.execute(query, (twin, version, at_us))
 
 
 def forget(connection: Connection, twin: int, version: int, after_us: int, until_us: int) -> None:

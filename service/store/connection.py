@@ -1,5 +1,37 @@
-"""The connection that every operation of the store is handed."""
+"""The connection that every operation of the store is handed: the one dialect of SQL that both databases speak.
 
-import sqlite3
+Parameters are ``?``. What the two databases do not share is written so that both understand it: ``RETURNING`` instead of a row
+id, ``ON CONFLICT`` instead of ``REPLACE``, ``CASE`` instead of a least or greatest of two values.
+"""
 
-Connection = sqlite3.Connection
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Protocol
+
+Row = tuple[Any, ...]
+
+
+class Cursor(Protocol):
+    """The rows of one statement."""
+
+    @property
+    def rowcount(self) -> int:
+        """How many rows a statement changed."""
+
+    def fetchone(self) -> Any:
+        """Return the next row, None after the last one."""
+
+    def fetchall(self) -> list[Any]:
+        """Return the rows that are left."""
+
+    def __iter__(self) -> Iterator[Any]:
+        """Iterate over the rows that are left."""
+
+
+class Connection(Protocol):
+    """A connection inside a transaction, which begins and ends elsewhere."""
+
+    def execute(self, query: str, parameters: Sequence[Any] = ..., /) -> Cursor:
+        """Run one statement."""
+
+    def executemany(self, query: str, parameters: Iterable[Sequence[Any]], /) -> Cursor:
+        """Run one statement once for each row of parameters."""

@@ -1,15 +1,11 @@
 """The database: one writer thread whose transactions many requests share, and readers that never wait for it.
 
 This is the narrow place through which all SQL goes: ``write(operation, ...)`` and ``read(operation, ...)``, where an
-operation is a function of a connection from one of the table modules. Another database needs its own connection here
-and its own table modules, nothing else.
+operation is a function of a connection from one of the table modules. Which database it is, an ``Engine`` knows.
 """
 
 import asyncio
-import contextlib
-import logging
 import queue
-import sqlite3
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,11 +15,8 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.store.connection import Connection
-from service.store.errors import DiskFull, StoreError
-from service.store.lock import FileLock
-from service.store.migrations import migrate
-
-log = logging.getLogger("service.store")
+from service.store.engine import Engine
+from service.store.errors import Unavailable
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -31,49 +24,61 @@ T = TypeVar("T")
 SHARE = 256
 """Most operations that share one commit."""
 READERS = 4
-PRAGMAS = (
-    "auto_vacuum = INCREMENTAL",  # holds for new files; others keep what they were made with
-    "journal_mode = WAL",
-    "synchronous = FULL",
-    "foreign_keys = ON",
-    "mmap_size = 268435456",
-    "temp_store = MEMORY",
-)
-FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
+ATTEMPTS = 4
+"""So often is a transaction run that others stood in the way of."""
 
 
 @dataclass(slots=True)
 class _Order:
-    """One operation on its way to the writer, and where its result goes."""
+    """One operation on its way to the writer, which twin it writes to, and where its result goes."""
 
     operation: Callable[[Connection], Any]
     then: Callable[[Any, BaseException | None], None]
+    twin: int | None = None
     result: Any = None
     error: BaseException | None = None
 
 
-class Database:
-    """An open database file."""
+def open_engine(place: Path | str) -> Engine:
+    """Open a database: a SQLite file, or a server by its URL (``postgresql://…``); StoreError if that is impossible."""
+    if isinstance(place, str):
+        from service.store.postgres.engine import PostgresEngine
 
-    def __init__(self, path: Path) -> None:
-        """Lock, open and migrate the file; StoreError if that is impossible."""
-        self._path = path
-        self._lock = FileLock(path)
-        try:
-            self._connection = _open(path)
-        except sqlite3.Error as error:
-            self._lock.release()
-            raise StoreError(f"{path}: cannot be used as a database ({error}); check TWIN_DATABASE_URL") from error
+        return PostgresEngine(place)
+    from service.store.sqlite.engine import SqliteEngine
+
+    return SqliteEngine(place)
+
+
+class Database:
+    """An open database."""
+
+    def __init__(self, place: Path | str) -> None:
+        """Open and migrate it; StoreError if that is impossible."""
+        self.engine = open_engine(place)
+        self._session = self.engine.session()
+        self._faults: tuple[type[Exception], ...] = (*self.engine.faults, Unavailable)
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
-        self._local = threading.local()
-        self._opened: list[Connection] = []
         self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="reader")
         self._writer = threading.Thread(target=self._write_forever, name="writer", daemon=True)
         self._writer.start()
 
+    @property
+    def is_shared(self) -> bool:
+        """Whether other processes may write to it at the same time."""
+        return self.engine.is_shared
+
     async def write(self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Return the operation's result once it is durably committed."""
         return await asyncio.wrap_future(self.submit(operation, *args, **kwargs))
+
+    async def write_to(
+        self, twin: int, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        """The same for an operation that reads and writes what belongs to a twin: no other write of it comes between."""
+        answer: Future[T] = Future()
+        self.submit_to(twin, partial(_settle, answer), operation, *args, **kwargs)
+        return await asyncio.wrap_future(answer)
 
     def submit(
         self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs
@@ -93,37 +98,36 @@ class Database:
         """The same; after the commit the writer calls ``then`` with the result, or with the error."""
         self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), then))
 
+    def submit_to(
+        self,
+        twin: int,
+        then: Callable[[T, BaseException | None], None],
+        operation: Callable[Concatenate[Connection, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """The same for what belongs to a twin, see ``write_to``."""
+        self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), then, twin))
+
     async def read(self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run an operation on a read-only snapshot, beside the writer and other readers."""
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._readers, lambda: self._read(lambda c: operation(c, *args, **kwargs)))
+        return await loop.run_in_executor(
+            self._readers, lambda: self.engine.read(lambda c: operation(c, *args, **kwargs))
+        )
 
     def close(self) -> None:
-        """Finish what is queued, then close the file and release its lock."""
+        """Finish what is queued, then close the database."""
         self._orders.put(None)
         self._writer.join()
         self._readers.shutdown()
-        for connection in self._opened:
-            connection.close()
-        self._connection.close()
-        self._lock.release()
+        self._session.close()
+        self.engine.close()
 
     @property
     def backlog(self) -> int:
         """Operations that wait for the writer."""
         return self._orders.qsize()
-
-    def _read(self, operation: Callable[[Connection], T]) -> T:
-        connection: Connection | None = getattr(self._local, "connection", None)
-        if connection is None:
-            connection = _connect(self._path, read_only=True)
-            self._local.connection = connection
-            self._opened.append(connection)
-        connection.execute("BEGIN")
-        try:
-            return operation(connection)
-        finally:
-            connection.execute("ROLLBACK")
 
     def _write_forever(self) -> None:
         stop = False
@@ -152,55 +156,68 @@ class Database:
         Nearly always all of them succeed. If one fails, everything is undone and done again with each order in a
         savepoint of its own, so that it undoes itself alone.
         """
-        try:
-            if not self._commit_together(orders):
-                self._commit_apart(orders)
-        except sqlite3.Error as error:
-            self._roll_back()
+        for attempt in range(ATTEMPTS):
             for order in orders:
-                order.error = order.error or _refusal(error)
+                order.error = None
+            try:
+                if not self._commit_together(orders):
+                    self._commit_apart(orders)
+                break
+            except self._faults as error:
+                self._session.roll_back()
+                if attempt + 1 < ATTEMPTS and self.engine.is_passing(error):
+                    continue
+                for order in orders:
+                    order.error = order.error or self._refusal(error)
+                break
         for order in orders:
             order.then(order.result, order.error)
 
     def _commit_together(self, orders: list[_Order]) -> bool:
         """Return whether all orders succeeded and are committed."""
-        self._connection.execute("BEGIN IMMEDIATE")
+        session = self._session
+        session.begin(_twins(orders))
         try:
             for order in orders:
-                order.result = order.operation(self._connection)
+                order.result = order.operation(session.connection)
         except Exception as error:
-            self._roll_back()
+            session.roll_back()
             if len(orders) > 1:
                 return False
-            orders[0].error = _refusal(error) if isinstance(error, sqlite3.Error) else error
+            if self.engine.is_passing(error):
+                raise
+            orders[0].error = self._refusal(error)
             return True
-        self._connection.execute("COMMIT")
+        session.commit()
         return True
 
     def _commit_apart(self, orders: list[_Order]) -> None:
-        self._connection.execute("BEGIN IMMEDIATE")
+        self._session.begin(_twins(orders))
         for order in orders:
             self._attempt(order)
-        self._connection.execute("COMMIT")
+        self._session.commit()
 
     def _attempt(self, order: _Order) -> None:
-        self._connection.execute("SAVEPOINT operation")
+        session = self._session
+        session.connection.execute("SAVEPOINT operation")
         try:
-            order.result = order.operation(self._connection)
-        except sqlite3.Error as error:
-            if not self._connection.in_transaction:  # a full disk rolls the whole transaction back
+            order.result = order.operation(session.connection)
+        except self.engine.faults as error:
+            if not session.in_transaction or self.engine.is_passing(error):  # a full disk rolls everything back
                 raise
-            order.error = _refusal(error)
+            order.error = self._refusal(error)
         except Exception as error:
             order.error = error
         if order.error is not None:
-            self._connection.execute("ROLLBACK TO operation")
-        self._connection.execute("RELEASE operation")
+            session.connection.execute("ROLLBACK TO operation")
+        session.connection.execute("RELEASE operation")
 
-    def _roll_back(self) -> None:
-        if self._connection.in_transaction:
-            with contextlib.suppress(sqlite3.Error):  # the commit's own error is the one to report
-                self._connection.execute("ROLLBACK")
+    def _refusal(self, error: Exception) -> Exception:
+        return self.engine.refusal(error) if isinstance(error, self.engine.faults) else error
+
+
+def _twins(orders: list[_Order]) -> set[int]:
+    return {order.twin for order in orders if order.twin is not None}
 
 
 def _settle(answer: "Future[T]", result: T, error: BaseException | None) -> None:
@@ -211,35 +228,3 @@ def _settle(answer: "Future[T]", result: T, error: BaseException | None) -> None
         answer.set_exception(error)
     else:
         answer.set_result(result)
-
-
-def _refusal(error: sqlite3.Error) -> Exception:
-    """Return what the caller is told about a failed write."""
-    name = getattr(error, "sqlite_errorname", "")
-    if name.startswith(FULL):
-        log.error("the disk is full; nothing of the write was stored", extra={"sqlite": name})
-        return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
-    return error
-
-
-def _open(path: Path) -> Connection:
-    """Return the writer's connection to a database of the present schema."""
-    connection = _connect(path)
-    try:
-        migrate(connection)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
-
-
-def _connect(path: Path, read_only: bool = False) -> Connection:
-    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
-    settings = PRAGMAS + (("query_only = ON",) if read_only else ())
-    try:
-        for setting in settings:
-            connection.execute(f"PRAGMA {setting}")
-    except sqlite3.Error:
-        connection.close()
-        raise
-    return connection

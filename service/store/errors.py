@@ -22,3 +22,11 @@ class Conflicting(Refusal):
 
 class DiskFull(Refusal):
     """There is no room for what was to be stored; nothing of it was."""
+
+
+class Unavailable(Refusal):
+    """The database cannot be reached; whether a write under way was stored is not known, and sending it again does no harm."""
+
+
+class LeaseLost(Exception):
+    """A write of somebody who no longer owns what it concerns; nothing of it was stored."""

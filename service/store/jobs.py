@@ -7,7 +7,7 @@ import orjson
 
 from service.instants import format_instant, now_us
 from service.store.connection import Connection
-from service.store.errors import Missing, TwinGone
+from service.store.errors import LeaseLost, Missing, TwinGone
 
 KEPT = 200
 """Jobs of one kind that are kept per twin; older ones are forgotten."""
@@ -86,18 +86,99 @@ def asked_since_activation(connection: Connection, twin: int, kind: str) -> bool
     return bool(connection.execute(query, (twin, kind, twin)).fetchone()[0])
 
 
-def begin(connection: Connection, job: str) -> None:
-    """Mark a queued job as running."""
-    query = "UPDATE job SET state = 'running', started_us = ?, message = 'starting' WHERE id = ? AND state = 'queued'"
+def waiting(connection: Connection, twin: int) -> int:
+    """Return how many jobs of a twin have not ended."""
+    query = "SELECT count(*) FROM job WHERE twin = ? AND state IN ('queued', 'running')"
+    return int(connection.execute(query, (twin,)).fetchone()[0])
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A job in the hands of a worker; ``attempt`` is the token without which nothing of it is written."""
+
+    job: str
+    twin: int
+    kind: str
+    request: dict[str, Any]
+    attempt: int
+
+
+def claim(connection: Connection, worker: str, lease_us: int, *, is_shared: bool) -> Claim | None:
+    """Take the oldest job that waits, or whose worker has not been heard of for ``lease_us``; None if there is none.
+
+    Parameters
+    ----------
+    is_shared
+        Whether others claim at the same time: each then passes over what another one is about to take.
+    """
+    row = connection.execute(
+        f"""UPDATE job SET state = 'running', worker = ?, attempt = attempt + 1, beat_us = clock_us(), message = 'starting',
+            started_us = coalesce(started_us, ?) WHERE number = (SELECT number FROM job WHERE state = 'queued'
+            OR (state = 'running' AND worker != ? AND beat_us < clock_us() - ?)
+            ORDER BY number LIMIT 1 {"FOR UPDATE SKIP LOCKED" if is_shared else ""})
+            RETURNING id, twin, kind, request, attempt""",
+        (worker, now_us(), worker, lease_us),
+    ).fetchone()
+    return None if row is None else Claim(row[0], row[1], row[2], orjson.loads(row[3]), row[4])
+
+
+def beat(connection: Connection, worker: str) -> dict[str, tuple[int, bool]]:
+    """Say that a worker lives; return what is in its hands: job -> (attempt, whether it shall be cancelled)."""
+    query = "UPDATE job SET beat_us = clock_us() WHERE worker = ? AND state = 'running' RETURNING id, attempt, cancel"
+    rows = connection.execute(query, (worker,)).fetchall()
+    return {job: (attempt, bool(cancel)) for job, attempt, cancel in rows}
+
+
+def ask_to_cancel(connection: Connection, job: str) -> None:
+    """Let whoever does a job hear that it shall end."""
+    connection.execute("UPDATE job SET cancel = 1 WHERE id = ? AND state = 'running'", (job,))
+
+
+def hold(connection: Connection, held: Claim) -> None:
+    """Make sure that a job is still in the same hands until the transaction ends; LeaseLost if it is not."""
+    query = "UPDATE job SET beat_us = clock_us() WHERE id = ? AND attempt = ? AND state = 'running'"
+    if connection.execute(query, (held.job, held.attempt)).rowcount == 0:
+        raise LeaseLost(f"job {held.job} is in other hands, or has ended")
+
+
+def report(connection: Connection, held: Claim, progress: float, message: str) -> None:
+    """Note how far a running job is; progress never goes back. LeaseLost if it is in other hands."""
+    hold(connection, held)
+    connection.execute(
+        "UPDATE job SET progress = CASE WHEN progress > ? THEN progress ELSE ? END, message = ? WHERE id = ?",
+        (progress, progress, message, held.job),
+    )
+
+
+def end(connection: Connection, held: Claim, state: str, message: str) -> None:
+    """End a job without a result; LeaseLost if it is in other hands."""
+    hold(connection, held)
+    finish(connection, held.job, state, message)
+
+
+def put_back(connection: Connection, held: Claim) -> None:
+    """Let a job wait for another worker; LeaseLost if it is in other hands already."""
+    hold(connection, held)
+    query = "UPDATE job SET state = 'queued', message = 'waiting for a free worker', attempt = attempt - 1 WHERE id = ?"
+    connection.execute(query, (held.job,))
+
+
+def finish_waiting(connection: Connection, job: str) -> None:
+    """Cancel a job that nobody does yet."""
+    query = """UPDATE job SET state = 'cancelled', message = 'cancelled', finished_us = ?
+               WHERE id = ? AND state = 'queued'"""
     connection.execute(query, (now_us(), job))
 
 
-def report(connection: Connection, job: str, progress: float, message: str) -> None:
-    """Note how far a running job is; progress never goes back."""
-    connection.execute(
-        "UPDATE job SET progress = max(progress, ?), message = ? WHERE id = ? AND state = 'running'",
-        (progress, message, job),
-    )
+def leave(connection: Connection, worker: str, *, is_shared: bool) -> None:
+    """Let go of what a worker holds as it ends: others go on with it, or, where there are none, nothing waits any more."""
+    if is_shared:
+        query = "UPDATE job SET state = 'queued', attempt = attempt - 1 WHERE worker = ? AND state = 'running'"
+        connection.execute(query, (worker,))
+    else:
+        query = """UPDATE job SET state = 'cancelled', message = 'cancelled', finished_us = ?
+                   WHERE state IN ('queued', 'running')"""
+        connection.execute(query, (now_us(),))
 
 
 def finish(

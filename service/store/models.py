@@ -74,7 +74,7 @@ class Active:
 
 _SELECT = """
     SELECT version, created_us, source, summary,
-           version IS (SELECT version FROM activation WHERE activation.twin = model.twin ORDER BY id DESC LIMIT 1)
+           version = (SELECT version FROM activation WHERE activation.twin = model.twin ORDER BY id DESC LIMIT 1)
     FROM model WHERE twin = ?
 """
 

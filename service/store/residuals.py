@@ -95,7 +95,7 @@ def _insert(connection: Connection, twin: int, residuals: Residuals) -> None:
     packed = _pack(residuals)
     row = connection.execute(
         """INSERT INTO residual (twin, version, n, first_us, last_us, last_seq, seq, time, value, n_rows)
-           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)""",
+           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id""",
         (
             twin,
             residuals.version,
@@ -109,7 +109,7 @@ def _insert(connection: Connection, twin: int, residuals: Residuals) -> None:
             packed.shape[0],
         ),
     )
-    outline.put(connection, "residual", int(row.lastrowid or 0), residuals.time_us, packed)
+    outline.put(connection, "residual", int(row.fetchone()[0]), residuals.time_us, packed)
 
 
 def forget(connection: Connection, twin: int, version: int, n_sensors: int, after_us: int, until_us: int) -> None:

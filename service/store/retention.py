@@ -12,8 +12,6 @@ from service.store.errors import Conflicting, Missing
 
 ROWS = 8
 """So many chunks, of up to some megabytes each, are removed in one write."""
-PAGES = 512
-"""So many free pages are given back to the file system in one write."""
 EVENTS = 20_000
 """Messages that are kept per twin: a reader that lags further behind is told to have missed them."""
 _US_PER_DAY = 86_400_000_000
@@ -100,9 +98,9 @@ def _old_samples(connection: Connection, twin: int, kept: Retention, last_us: in
     if rows:
         connection.executemany("DELETE FROM chunk WHERE id = ?", [(chunk,) for chunk, _ in rows])
         connection.execute(
-            """UPDATE head SET samples = max(samples - ?, 0),
+            """UPDATE head SET samples = CASE WHEN samples > ? THEN samples - ? ELSE 0 END,
                first_us = (SELECT min(first_us) FROM chunk WHERE chunk.twin = head.twin) WHERE twin = ?""",
-            (sum(n for _, n in rows), twin),
+            (sum(n for _, n in rows), sum(n for _, n in rows), twin),
         )
     return len(rows)
 
@@ -136,7 +134,7 @@ def _old_jobs(connection: Connection, twin: int, kept: Retention) -> int:
     for kind in ("calibration", "diagnosis"):
         removed += connection.execute(
             """DELETE FROM job WHERE number IN (SELECT number FROM job WHERE twin = ? AND kind = ?
-               AND state NOT IN ('queued', 'running') ORDER BY number DESC LIMIT -1 OFFSET ?)""",
+               AND state NOT IN ('queued', 'running') ORDER BY number DESC LIMIT 1000000 OFFSET ?)""",
             (twin, kind, kept.jobs),
         ).rowcount
     return removed
@@ -146,10 +144,8 @@ def _old_models(connection: Connection, twin: int, kept: Retention) -> int:
     """Remove one version that is neither active nor the parent of one that stays."""
     if kept.models is None:
         return 0
-    query = (
-        "SELECT version, json_extract(summary, '$.provenance.parent') FROM model WHERE twin = ? ORDER BY version DESC"
-    )
-    rows = connection.execute(query, (twin,)).fetchall()
+    query = "SELECT version, summary FROM model WHERE twin = ? ORDER BY version DESC"
+    rows = [(version, _parent(text)) for version, text in connection.execute(query, (twin,))]
     active = _active(connection, twin)
     stay = {active, *[version for version, _ in rows if version != active][: kept.models]}
     stay |= {parent for version, parent in rows if version in stay}
@@ -157,6 +153,11 @@ def _old_models(connection: Connection, twin: int, kept: Retention) -> int:
     if gone:
         remove_model(connection, twin, gone[-1])
     return len(gone[-1:])
+
+
+def _parent(summary: str) -> int | None:
+    found: int | None = orjson.loads(summary).get("provenance", {}).get("parent")
+    return found
 
 
 def _active(connection: Connection, twin: int) -> int | None:
@@ -191,7 +192,7 @@ def _dear_residuals(connection: Connection, twin: int) -> int:
         return removed
     size = "SELECT coalesce(sum(length(value) + 8 * n), 0) FROM {} WHERE twin = ?"
     versions = connection.execute(
-        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version IS NOT ?", (twin, _active(connection, twin))
+        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version != ?", (twin, _active(connection, twin) or 0)
     ).fetchall()
     if not versions or (
         connection.execute(size.format("residual"), (twin,)).fetchone()[0]
@@ -203,13 +204,3 @@ def _dear_residuals(connection: Connection, twin: int) -> int:
     connection.execute("DELETE FROM checkpoint WHERE twin = ? AND version = ?", (twin, oldest))
     query = "DELETE FROM residual WHERE id IN (SELECT id FROM residual WHERE twin = ? AND version = ? LIMIT ?)"
     return connection.execute(query, (twin, oldest, ROWS)).rowcount
-
-
-def vacuum(connection: Connection) -> int:
-    """Give free pages back to the file system; files of earlier releases keep theirs for later use."""
-    mode = connection.execute("PRAGMA auto_vacuum").fetchone()[0]
-    free = connection.execute("PRAGMA freelist_count").fetchone()[0]
-    if mode != 2 or free == 0:
-        return 0
-    connection.execute(f"PRAGMA incremental_vacuum({PAGES})").fetchall()
-    return min(int(free), PAGES)

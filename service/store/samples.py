@@ -113,11 +113,12 @@ def _advance(
     small = n < SMALL
     row: tuple[int, int, int] | None = connection.execute(
         """UPDATE head SET seq = seq + ?, samples = samples + ?,
-           first_us = min(coalesce(first_us, ?), ?), last_us = max(coalesce(last_us, ?), ?),
+           first_us = CASE WHEN first_us < ? THEN first_us ELSE ? END,
+           last_us = CASE WHEN last_us > ? THEN last_us ELSE ? END,
            small_chunks = small_chunks + ?, small_rows = small_rows + ?
            WHERE twin = ? AND (last_us IS NULL OR last_us < ?) RETURNING seq, small_chunks, small_rows""",
         (
-            *(n, n_instants, first_us, first_us, last_us, last_us, small, n if small else 0, twin),
+            *(n, n_instants, first_us, first_us, last_us, last_us, int(small), n if small else 0, twin),
             first_us if after_all else 2**62,
         ),
     ).fetchone()
@@ -137,7 +138,7 @@ def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Bat
     """Store a chunk as it is; the head of the archive has been moved already."""
     row = connection.execute(
         """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
-           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)""",
+           VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) RETURNING id""",
         (
             twin,
             int(batch.time_us.size),
@@ -150,7 +151,7 @@ def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Bat
             None if batch.received_us is None else np.ascontiguousarray(batch.received_us, dtype="<i8").data,
         ),
     )
-    outline.put(connection, "chunk", int(row.lastrowid or 0), batch.time_us, batch.values)
+    outline.put(connection, "chunk", int(row.fetchone()[0]), batch.time_us, batch.values)
 
 
 def unpack(n_rows: int, time: bytes, value: bytes, received: bytes | None) -> Batch:
@@ -215,6 +216,8 @@ def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np
         dtype=np.int64,
     ).reshape(-1, 3)
     hit = np.searchsorted(instants, spans[:, 1]) < np.searchsorted(instants, spans[:, 2], side="right")
+    if not hit.any():
+        return np.empty(0, dtype=np.int64), np.empty((n_rows, 0))
     ids = ",".join(map(str, spans[hit, 0].tolist()))
     chunks = connection.execute(f"SELECT id, time FROM chunk WHERE id IN ({ids})").fetchall()
     stored = [np.frombuffer(time, dtype="<i8") for _, time in chunks]

@@ -59,8 +59,13 @@ def register(connection: Connection, name: str, specification: dict[str, Any]) -
     except Missing:
         text = orjson.dumps(specification).decode()
         values = (name, text, now_us())
-        row = connection.execute("INSERT INTO twin (name, specification, created_us) VALUES (?, ?, ?)", values)
-        connection.execute("INSERT INTO head (twin) VALUES (?)", (row.lastrowid,))
+        query = (
+            "INSERT INTO twin (name, specification, created_us) VALUES (?, ?, ?) ON CONFLICT DO NOTHING RETURNING id"
+        )
+        row = connection.execute(query, values).fetchone()
+        if row is None:  # another process registered it just now
+            return register(connection, name, specification)
+        connection.execute("INSERT INTO head (twin) VALUES (?)", row)
         return get(connection, name), True
     if canonical(known.specification) != canonical(specification):
         raise Conflicting(

@@ -23,10 +23,10 @@ def select(connection: Connection) -> list[Vitals]:
         """SELECT twin.name, head.last_us,
                   (SELECT count(*) FROM anomaly WHERE anomaly.twin = twin.id AND anomaly.stop_us IS NULL),
                   (SELECT count(*) FROM alarm WHERE colour = 'yellow' AND alarm.twin = twin.id AND stop_us IS NULL
-                   AND coalesce(shelved_until_us, 0) <= :now),
+                   AND coalesce(shelved_until_us, 0) <= ?),
                   (SELECT count(*) FROM alarm WHERE colour = 'red' AND alarm.twin = twin.id AND stop_us IS NULL
-                   AND coalesce(shelved_until_us, 0) <= :now)
+                   AND coalesce(shelved_until_us, 0) <= ?)
            FROM twin JOIN head ON head.twin = twin.id""",
-        {"now": now_us()},
+        (now_us(), now_us()),
     )
     return [Vitals(*row) for row in rows]

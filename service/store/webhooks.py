@@ -91,10 +91,10 @@ def add(
     """Store a webhook; without a secret it is given one."""
     texts = [None if names is None else orjson.dumps(sorted(names)).decode() for names in (twins, types)]
     row = connection.execute(
-        "INSERT INTO webhook (url, secret, twins, types, created_us) VALUES (?, ?, ?, ?, ?)",
+        "INSERT INTO webhook (url, secret, twins, types, created_us) VALUES (?, ?, ?, ?, ?) RETURNING id",
         (url, secret or secrets.token_hex(32), *texts, now_us()),
     )
-    return get(connection, int(row.lastrowid or 0))
+    return get(connection, int(row.fetchone()[0]))
 
 
 def get(connection: Connection, number: int) -> Webhook:
@@ -188,8 +188,9 @@ def settle(connection: Connection, number: int, state: State, reason: str, next_
 
 def deliveries(connection: Connection, state: State | None, most: int) -> Sequence[Delivery]:
     """Return deliveries, the newest first."""
-    query = _DELIVERIES + "WHERE ? IS NULL OR state = ? ORDER BY id DESC LIMIT ?"
-    return [Delivery(*row) for row in connection.execute(query, (state, state, most))]
+    where, values = ("", ()) if state is None else ("WHERE state = ? ", (state,))
+    query = _DELIVERIES + where + "ORDER BY id DESC LIMIT ?"
+    return [Delivery(*row) for row in connection.execute(query, (*values, most))]
 
 
 def retry(connection: Connection, number: int) -> Delivery:

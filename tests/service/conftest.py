@@ -1,5 +1,6 @@
 """A service in memory's place: one temporary file per test, driven through its real routes."""
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -13,6 +14,7 @@ from service.app import create_app
 from service.live import engine
 from service.settings import read_settings
 from tests.service.harness import AppClient
+from tests.service.postgres import NoPostgres, fresh_database, own_server
 
 SPEC: dict[str, Any] = {
     "twin": "benchsat",
@@ -31,6 +33,8 @@ SPEC: dict[str, Any] = {
     "loads": [{"channel": "Q_px", "node": "px"}],
 }
 
+STORE, NAMED = (os.environ.get(name) for name in ("TWIN_TEST_STORE", "TWIN_TEST_POSTGRES_URL"))
+"""Read before tests empty the environment of what is the service's."""
 MakeClient = Callable[..., AppClient]
 
 
@@ -81,16 +85,45 @@ def standing_workers() -> Iterator[StandingWorkers]:
     workers.end()
 
 
+@pytest.fixture(scope="session")
+def postgres_url() -> Iterator[str]:
+    """A PostgreSQL server: the one that is named, or one of our own."""
+    if NAMED:
+        yield NAMED
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            server = stack.enter_context(own_server())
+        except NoPostgres as reason:
+            pytest.skip(str(reason))
+        yield server.url
+
+
+@pytest.fixture
+def postgres(postgres_url: str) -> Iterator[str]:
+    """An empty PostgreSQL database."""
+    with fresh_database(postgres_url) as url:
+        yield url
+
+
+@pytest.fixture
+def database_url(tmp_path: Path, request: pytest.FixtureRequest) -> str:
+    """An empty database: a SQLite file, or PostgreSQL where ``TWIN_TEST_STORE`` says so."""
+    if STORE == "postgres":
+        return str(request.getfixturevalue("postgres"))
+    return f"sqlite:///{tmp_path / 'twin.sqlite3'}"
+
+
 @pytest.fixture
 def make_client(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, standing_workers: StandingWorkers
+    database_url: str, monkeypatch: pytest.MonkeyPatch, standing_workers: StandingWorkers
 ) -> Iterator[MakeClient]:
     """Return a function that starts a service on the test's database; all are stopped at the end."""
     monkeypatch.setattr(engine, "_start", lambda workers: START(1) if workers == 1 else standing_workers)
     opened: list[AppClient] = []
 
     def make(workbench: Any = None, **settings: Any) -> AppClient:
-        url = f"sqlite:///{tmp_path / 'twin.sqlite3'}"
+        url = database_url
         client = AppClient(create_app(read_settings(**{"database_url": url, **settings}), workbench=workbench))
         opened.append(client)
         return client

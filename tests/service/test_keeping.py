@@ -21,7 +21,7 @@ from service.errors import Refusal
 from service.live.silence import Silence
 from service.logs import JsonLines
 from service.settings import SettingsError, read_settings
-from service.store import migrations
+from service.store.sqlite import migrations
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient

@@ -3,7 +3,7 @@
 The methods are looked up when asked for, so that reading a model file needs no compiler and no torch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
@@ -22,6 +22,7 @@ def calibrate(
     method: str = "second-order",
     loss: str = "squared",
     deadline: float = float("inf"),
+    training: Mapping[str, float] | None = None,
     progress: Progress = no_progress,
 ) -> CalibratedModel:
     """Calibrate a declared network against telemetry.
@@ -40,6 +41,9 @@ def calibrate(
     deadline
         On the clock of ``time.monotonic``: the second-order search ends there with the best so far; the summary's
         ``status`` is then ``deadline``. It holds for that method alone.
+    training
+        How ``neural-ode`` trains: ``learning_rate``, ``window_s``, ``max_iterations`` and ``patience``, as far as they are not
+        to be the paper's.
     progress
         Called with the fraction done and a message.
 
@@ -59,9 +63,11 @@ def calibrate(
         raise ModelError(f"unknown calibration method '{method}' (known: {', '.join(METHODS)})")
     if loss not in LOSSES:
         raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
+    if training and method != "neural-ode":
+        raise ModelError(f"{next(iter(training))} belongs to method 'neural-ode'")
     records = cut_at_gaps(records, spec.driving_channels)
     if method == "neural-ode":
-        model = _by_neural_ode(spec, records, loss, progress)
+        model = _by_neural_ode(spec, records, loss, dict(training or {}), progress)
     else:
         from twin_core.calibrate.explained import calibrate_and_explain
 
@@ -70,12 +76,14 @@ def calibrate(
     return model
 
 
-def _by_neural_ode(spec: TwinSpec, records: Sequence[Record], loss: str, progress: Progress) -> CalibratedModel:
+def _by_neural_ode(
+    spec: TwinSpec, records: Sequence[Record], loss: str, training: dict[str, float], progress: Progress
+) -> CalibratedModel:
     """Calibrate by the method of paper A."""
     if loss != "squared":
         raise ModelError(f"method 'neural-ode' knows the squared loss only; use second-order with '{loss}'")
     try:
-        from twin_core.calibrate.neural_ode import fit_neural_ode
+        from twin_core.calibrate.neural_ode import fit_neural_ode, recipe_of
     except ModuleNotFoundError as error:
         if error.name not in ("torch", "torchdiffeq"):
             raise
@@ -84,8 +92,8 @@ def _by_neural_ode(spec: TwinSpec, records: Sequence[Record], loss: str, progres
         ) from error
     from twin_core.calibrate.second_order import to_model
 
-    _, calibration = fit_neural_ode(spec, records, progress=progress)
-    return to_model(calibration, (), uncertain=False)
+    trained, calibration = fit_neural_ode(spec, records, recipe_of(training), progress=progress)
+    return to_model(calibration, (), trained.notices, uncertain=False)
 
 
 __all__ = ["LOSSES", "METHODS", "CalibratedModel", "calibrate"]

@@ -5,8 +5,8 @@ dT/dt = M(theta) z with M = diag(gamma) sum_k p_k E_k (paper A, section 3.1, eq.
 segments advance together as one disconnected graph (eq. 3), in time counted in samples.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,6 +27,9 @@ from twin_core.telemetry import Record
 
 LIMIT_K = 200.0
 """v of the limiter (eq. 4): it leaves 200 to 400 K alone."""
+
+AT_THE_END = 0.02
+"""A parameter this near to an end of what Psi reaches, as a share of it, may lie beyond: there Psi hardly moves."""
 
 SCALE_OF_GUESS = 4.0
 """s_p over the guess where no bound is declared; a parameter without a guess gets s_p from its starting value alike."""
@@ -61,6 +64,26 @@ class Recipe:
     solver: str = "rk4"
 
 
+def recipe_of(changes: Mapping[str, float]) -> Recipe:
+    """Return the paper's recipe with some numbers changed.
+
+    Raises
+    ------
+    ModelError
+        If one is unknown, not positive, or no whole number where only those make sense.
+    """
+    known = ("learning_rate", "window_s", "max_iterations", "patience")
+    for name, value in changes.items():
+        if name not in known:
+            raise ModelError(f"unknown setting '{name}' of method 'neural-ode' (known: {', '.join(known)})")
+        if not 0.0 < value < float("inf"):
+            raise ModelError(f"{name}: must be a positive number (got {value:g})")
+        if name in known[2:] and value != int(value):
+            raise ModelError(f"{name}: must be a whole number (got {value:g})")
+    whole = {name: int(value) if name in known[2:] else float(value) for name, value in changes.items()}
+    return replace(Recipe(), **whole)  # type: ignore[arg-type]
+
+
 @dataclass(frozen=True)
 class Training:
     """What a training run leaves.
@@ -73,12 +96,15 @@ class Training:
         Mean squared errors of every epoch.
     status
         Why it stopped.
+    notices
+        Parameters that ended at the end of what Psi reaches.
     """
 
     values: FloatArray
     train_K2: FloatArray
     validation_K2: FloatArray
     status: Status
+    notices: tuple[str, ...] = ()
 
 
 def embed(free: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
@@ -110,13 +136,41 @@ class Embedding:
         self.lower, upper = torch.tensor(ranges, dtype=torch.float64).reshape(-1, 2).T
         self.scale, self._inverse = upper - self.lower, torch.as_tensor(inverse)
         start = torch.tensor([p.value for p in chosen], dtype=torch.float64)
-        self.start = unembed(torch.where(self._inverse, 1.0 / start, start) - self.lower, self.scale)
+        entered = torch.where(self._inverse, 1.0 / start, start)
+        for parameter, value, low, high in zip(
+            chosen, entered.tolist(), self.lower.tolist(), upper.tolist(), strict=True
+        ):
+            if not low < value < high:
+                raise ModelError(
+                    f"{parameter.name}: the guess {parameter.value:g} is not inside its bounds, between which method"
+                    " 'neural-ode' searches; move the guess or the bounds"
+                )
+        self.start = unembed(entered - self.lower, self.scale)
+        self._chosen = chosen
 
     def values(self, free: torch.Tensor) -> torch.Tensor:
         """Return all physical values, (n_parameters,), of p~ (n_free,)."""
         value = self.lower + embed(free, self.scale)
         value = torch.where(self._inverse, 1.0 / value, value)
         return torch.as_tensor(self._parameters.values).index_put((self._index,), value)
+
+    def beyond(self, free: torch.Tensor) -> tuple[str, ...]:
+        """Return a notice for every parameter that ended where Psi ends, which p~ (n_free,) tells."""
+        shares = (embed(free, self.scale) / self.scale).tolist()
+        found = []
+        for parameter, share, low, scale, inverse in zip(
+            self._chosen, shares, self.lower.tolist(), self.scale.tolist(), self._inverse.tolist(), strict=True
+        ):
+            if AT_THE_END <= share <= 1.0 - AT_THE_END:
+                continue
+            ends = (low, low + scale)
+            if inverse:
+                ends = (1.0 / ends[1], 1.0 / ends[0] if ends[0] > 0.0 else float("inf"))
+            found.append(
+                f"{parameter.name}: ended at the end of what method 'neural-ode' reaches, {ends[0]:.3g} to {ends[1]:.3g}"
+                f" {parameter.unit}; the truth may lie beyond: give a nearer guess, or wider bounds"
+            )
+        return tuple(found)
 
 
 def _range(parameter: Parameter, inverse: bool) -> tuple[float, float]:
@@ -239,7 +293,8 @@ class Trainer:
             if iteration % 10 == 0:
                 progress(iteration / recipe.max_iterations, f"epoch {iteration}, rms {history[-1][0] ** 0.5:.3g} K")
         train_K2, validation_K2 = np.array(history).reshape(-1, 2).T
-        return Training(self.embedding.values(best).numpy(), train_K2, validation_K2, status)
+        notices = self.embedding.beyond(best)
+        return Training(self.embedding.values(best).numpy(), train_K2, validation_K2, status, notices)
 
 
 def fit_neural_ode(

@@ -28,11 +28,11 @@ async def acknowledge(
 ) -> Alarm:
     """Say that somebody has seen an alarm; it lasts on, and the next one is a new one."""
     note = None if request is None else request.note
-    return Alarm(**(await service.database.write(alarms.acknowledge, twin.key, alarm, note)).wire())
+    return Alarm(**(await service.database.write_to(twin.key, alarms.acknowledge, twin.key, alarm, note)).wire())
 
 
 @router.post("/{alarm}/shelve", dependencies=[operates])
 async def shelve(service: Running, twin: NamedTwin, alarm: Number, request: ShelveRequest) -> Alarm:
     """Hear nothing of the limit of an alarm for a while, whatever happens at it; other limits are watched as ever."""
     until_us = now_us() + round(request.for_s * 1e6) if request.for_s else None
-    return Alarm(**(await service.database.write(alarms.shelve, twin.key, alarm, until_us)).wire())
+    return Alarm(**(await service.database.write_to(twin.key, alarms.shelve, twin.key, alarm, until_us)).wire())

@@ -46,7 +46,7 @@ async def forecast_as_is(
 
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
-    tracker = service.live.tracker(twin)
+    tracker = service.live.state(twin)
     silent_s = forecasts.silence_s(twin, await service.live.beats(twin))
     look = await forecasts.look_ahead(tracker, service.database, service.live.engine, request)
     expected = list(limits.expected(twin, look.position.time_us, look.made))
@@ -63,7 +63,7 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
 @router.get("/network", dependencies=[reads])
 async def network(service: Running, twin: NamedTwin) -> Network:
     """Return temperatures of all nodes, the unsensed ones too, and every heat flow between them, as they are now."""
-    active, position = await forecasts.state_of(service.live.tracker(twin))
+    active, position = await forecasts.state_of(service.live.state(twin))
     telemetry = forecasts.moment(twin, active, position)
     flows = await service.live.engine.flows(active.document, telemetry, position.state)
     return Network(model_version=active.version, time=format_instant(position.time_us), **flows)
@@ -84,7 +84,7 @@ async def list_residuals(
     max_points = bounded(max_points, 2 * len(twin.sensors) + 1)
     if version is not None:
         await service.database.read(models.get, twin.key, version)
-    tracker = service.live.tracker(twin)
+    tracker = service.live.state(twin)
     await tracker.settled(forecasts.SETTLE_S)
     chosen = version or (tracker.active.version if tracker.active is not None else 0)
     n_sensors = len(twin.sensors)

@@ -50,7 +50,7 @@ async def activate(service: Running, twin: NamedTwin, version: Version) -> Model
 @router.delete("/{version}", status_code=204, dependencies=[operates])
 async def delete(service: Running, twin: NamedTwin, version: Version) -> None:
     """Delete a version that is not active, with its residuals and anomalies."""
-    await service.database.write(retention.delete_model, twin.key, version)
+    await service.database.write_to(twin.key, retention.delete_model, twin.key, version)
     service.housekeeping.wake()
 
 

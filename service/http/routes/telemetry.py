@@ -61,7 +61,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     require(request, Role.ingest)
     refuse_unknown(request)
     service: Service = request.app.state.service
-    entry = service.registry.get(twin)
+    entry = await service.find(twin)
     body = (await request.receive()).get("body", b"")  # whole: see Bodies
     parse = _parser(request.headers.get("content-type", ""))
     if len(body) > PARSE_APART_BYTES:
@@ -207,7 +207,7 @@ async def discard(
     stop: Annotated[str | None, Query(description="First instant after the last one that goes.")] = None,
 ) -> Deletion:
     """Delete samples in quarantine; it can be undone for a day."""
-    made = await service.database.write(aside.discard, twin.key, len(twin.channels), *span(start, stop))
+    made = await service.database.write_to(twin.key, aside.discard, twin.key, len(twin.channels), *span(start, stop))
     log.warning("samples in quarantine were deleted", extra={"twin": twin.name, **made.wire()})
     return Deletion(**made.wire())
 

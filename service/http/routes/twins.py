@@ -179,7 +179,7 @@ async def keeps(service: Running, twin: NamedTwin) -> Retention:
 async def keep(service: Running, twin: NamedTwin, request: RetentionRequest) -> Retention:
     """Settle how long what belongs to the twin is kept; what is older goes for ever, within minutes."""
     wanted = retention.Retention(**request.model_dump())
-    await service.database.write(retention.put, twin.key, wanted)
+    await service.database.write_to(twin.key, retention.put, twin.key, wanted)
     service.housekeeping.wake()
     return Retention(**asdict(wanted))
 

@@ -30,8 +30,9 @@ def test_the_commands() -> None:
             "import",
             "init",
             "migrate",
+            "migrate-store",
         ),
-        *("print", "record", "register", "replay", "restore", "serve", "show", "simulate"),
+        *("print", "record", "register", "replay", "restore", "serve", "show", "simulate", "worker"),
     ]
 
 

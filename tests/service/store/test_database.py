@@ -5,16 +5,19 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+import psycopg
 import pytest
 
-from service.store import migrations
+from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import StoreError
+from service.store.sqlite import migrations
+from tests.service.postgres import STORES, place_of
 
 
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    opened = Database(tmp_path / "t.sqlite3")
+@pytest.fixture(params=STORES)
+def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Database]:
+    opened = Database(place_of(request, tmp_path))
     opened.submit(lambda c: c.execute("CREATE TABLE t (x INTEGER PRIMARY KEY)") and None).result()
     yield opened
     opened.close()
@@ -26,7 +29,7 @@ def put(connection: sqlite3.Connection, *numbers: int) -> int:
     return len(numbers)
 
 
-def numbers(connection: sqlite3.Connection) -> list[int]:
+def numbers(connection: Connection) -> list[int]:
     return [x for (x,) in connection.execute("SELECT x FROM t ORDER BY x")]
 
 
@@ -35,13 +38,13 @@ def test_a_failing_operation_undoes_itself_alone(database: Database) -> None:
     answers = [database.submit(put, 1), database.submit(put, 2, 1), database.submit(put, 3)]
     gate.result()
     assert answers[0].result() == 1 and answers[2].result() == 1
-    with pytest.raises(sqlite3.IntegrityError):
+    with pytest.raises((sqlite3.IntegrityError, psycopg.IntegrityError)):
         answers[1].result()
     assert asyncio.run(database.read(numbers)) == [1, 3]
 
 
 def test_any_exception_undoes_the_operation(database: Database) -> None:
-    def half(connection: sqlite3.Connection) -> None:
+    def half(connection: Connection) -> None:
         put(connection, 7)
         raise LookupError("gone")
 
@@ -53,21 +56,25 @@ def test_any_exception_undoes_the_operation(database: Database) -> None:
 def test_readers_cannot_write_and_see_what_is_committed(database: Database) -> None:
     async def use() -> list[int]:
         await database.write(put, 5)
-        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+        with pytest.raises((sqlite3.OperationalError, psycopg.InternalError), match=r"read-?only"):
             await database.read(put, 6)
         return await database.read(numbers)
 
     assert asyncio.run(use()) == [5]
 
 
-def test_one_process_at_a_time(database: Database, tmp_path: Path) -> None:
+def test_one_process_at_a_time(tmp_path: Path) -> None:
+    database = Database(tmp_path / "t.sqlite3")
     with pytest.raises(StoreError, match="another server uses this database"):
         Database(tmp_path / "t.sqlite3")
+    database.close()
 
 
-def test_durability_settings(database: Database) -> None:
+def test_durability_settings(tmp_path: Path) -> None:
+    database = Database(tmp_path / "t.sqlite3")
     assert database.submit(lambda c: c.execute("PRAGMA synchronous").fetchone()[0]).result() == 2
     assert database.submit(lambda c: c.execute("PRAGMA journal_mode").fetchone()[0]).result() == "wal"
+    database.close()
 
 
 def test_migrations_run_once_and_newer_files_are_refused(tmp_path: Path) -> None:

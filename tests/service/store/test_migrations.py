@@ -8,7 +8,7 @@ import numpy as np
 import orjson
 import pytest
 
-from service.store import migrations
+from service.store.sqlite import migrations
 from tests.service.conftest import SPEC
 
 TWIN = "/v1/twins/benchsat"

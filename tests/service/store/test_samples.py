@@ -1,6 +1,5 @@
 """The archive against a dictionary, through many batches in any order, compaction included."""
 
-import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,23 +8,25 @@ import pytest
 
 from service.store import events, residuals, samples, twins
 from service.store.batch import Batch
-from service.store.database import Database
+from service.store.connection import Connection
+from service.store.database import open_engine
 from service.store.residuals import Residuals
+from tests.service.postgres import STORES, place_of
 
 SPEC = {"twin": "t", "channels": {"a": {}, "b": {}}}
 
 
-@pytest.fixture
-def connection(tmp_path: Path) -> Iterator[sqlite3.Connection]:
-    database = Database(tmp_path / "t.sqlite3")
-    database.submit(lambda c: twins.register(c, "t", SPEC)).result()
-    with sqlite3.connect(tmp_path / "t.sqlite3", isolation_level=None) as own:
-        yield own
-    own.close()
-    database.close()
+@pytest.fixture(params=STORES)
+def connection(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Connection]:
+    engine = open_engine(place_of(request, tmp_path))
+    session = engine.session()
+    twins.register(session.connection, "t", SPEC)
+    yield session.connection
+    session.close()
+    engine.close()
 
 
-def test_many_batches_in_any_order(connection: sqlite3.Connection) -> None:
+def test_many_batches_in_any_order(connection: Connection) -> None:
     generator = np.random.default_rng(0)
     order = generator.permutation(4000)
     position, numbers = 0, []
@@ -51,7 +52,7 @@ def test_many_batches_in_any_order(connection: sqlite3.Connection) -> None:
     assert again.counts == [0, 4000, 0, 0]
 
 
-def test_compaction_does_not_span_idle_time(connection: sqlite3.Connection) -> None:
+def test_compaction_does_not_span_idle_time(connection: Connection) -> None:
     year_us = 365 * 86_400 * 10**6
     for number in range(samples.MOST_SMALL_CHUNKS):
         instant = (number % 2) * year_us + number * 10**6
@@ -60,14 +61,14 @@ def test_compaction_does_not_span_idle_time(connection: sqlite3.Connection) -> N
     assert len(spans) == 2 and max(spans)[0] < year_us // 1000
 
 
-def test_numbers_are_shared_with_events(connection: sqlite3.Connection) -> None:
+def test_numbers_are_shared_with_events(connection: Connection) -> None:
     one = Batch(np.array([5]), np.zeros((2, 1)))
     assert samples.append(connection, 1, one).first_seq == 1
     assert [e.seq for e in events.append(connection, 1, 0, [("job", {}), ("model", {})])] == [2, 3]
     assert samples.append(connection, 1, Batch(np.array([6]), np.zeros((2, 1)))).first_seq == 4
 
 
-def test_blocks_cover_everything_once(connection: sqlite3.Connection) -> None:
+def test_blocks_cover_everything_once(connection: Connection) -> None:
     for start in range(0, 20_000, 1000):
         time_us = np.arange(start, start + 1000, dtype=np.int64)
         samples.append(connection, 1, Batch(time_us, np.zeros((2, 1000))))
@@ -91,7 +92,7 @@ def wave(first: int, count: int) -> Batch:
     return Batch((first + np.arange(count, dtype=np.int64)) * 1000, values)
 
 
-def test_an_overview_holds_every_extreme(connection: sqlite3.Connection) -> None:
+def test_an_overview_holds_every_extreme(connection: Connection) -> None:
     for first in (0, 20_000, 40_000, 60_000):
         samples.append(connection, 1, wave(first, 15_000))
     late = Batch(np.array([62_000_500, 62_001_500]), np.array([[99.0, -99.0], [np.nan, 0.0]]))
@@ -118,7 +119,7 @@ def residual_stretch(first: int, count: int) -> Residuals:
     return Residuals(time_us // 1000 + 1, time_us, noise[:2], noise[2:4] ** 2, noise[4] ** 2, 1)
 
 
-def test_residuals_one_by_one_are_gathered_and_outlined(connection: sqlite3.Connection) -> None:
+def test_residuals_one_by_one_are_gathered_and_outlined(connection: Connection) -> None:
     stretches = [residual_stretch(0, 5000), *(residual_stretch(5000 + k, 1) for k in range(700))]
     connection.execute("BEGIN")
     for stretch in stretches:

@@ -10,7 +10,17 @@ import torch
 from tests.analytic import laplacian, linear_states
 from tests.helpers import central_difference, record_of
 from twin_core.calibrate import CalibratedModel, calibrate, neural_ode
-from twin_core.calibrate.neural_ode import Recipe, Trainer, embed, fit_neural_ode, inside, limit, roll, unembed
+from twin_core.calibrate.neural_ode import (
+    Embedding,
+    Recipe,
+    Trainer,
+    embed,
+    fit_neural_ode,
+    inside,
+    limit,
+    roll,
+    unembed,
+)
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.second_order import to_model
 from twin_core.calibrate.windows import balance_of
@@ -205,6 +215,39 @@ def test_the_model_forecasts_and_says_that_it_knows_no_uncertainty(monkeypatch: 
     ahead = forecast(again, record, 600.0)
     assert np.isfinite(ahead.mean_K).all()
     assert (ahead.quantiles_K[0.05] < ahead.quantiles_K[0.95]).all()
+
+
+def test_a_truth_beyond_the_reach_of_psi_is_told() -> None:
+    """From a guess of 4e4 J/K it reaches 1e4 J/K at best; the truth is 4e3."""
+    far = declared()
+    far["nodes"][0]["capacity_J_per_K"] = {"guess": 4.0e4}
+    settings = {"learning_rate": 0.1, "window_s": 400.0, "max_iterations": 150}
+    notices = calibrate(load_spec(far), [telemetry()], method="neural-ode", training=settings).summary["notices"]
+    (told,) = [line for line in notices if line.startswith("C:a: ended at the end")]
+    assert "1e+04 to inf J/K" in told
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"learning_rate": 0.0}, "learning_rate: must be a positive number"),
+        ({"patience": 2.5}, "patience: must be a whole number"),
+        ({"momentum": 0.9}, "unknown setting 'momentum'"),
+    ],
+)
+def test_settings_that_make_no_sense(settings: dict[str, float], message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        calibrate(load_spec(declared()), [telemetry()], method="neural-ode", training=settings)
+    with pytest.raises(ModelError, match="belongs to method 'neural-ode'"):
+        calibrate(load_spec(declared()), [telemetry()], training=settings)
+
+
+def test_a_guess_on_a_bound_is_refused() -> None:
+    network = build_network(load_spec(declared()))
+    on_bound = network.with_parameters(network.parameters.updated({"G:b|room": 4.0}))
+    problem = build_problem(on_bound, [telemetry()], np.full(2, 0.1))
+    with pytest.raises(ModelError, match=r"G:b\|room: the guess 4 is not inside its bounds"):
+        Embedding(problem)
 
 
 def test_what_the_method_does_not_know_is_refused() -> None:

@@ -286,6 +286,19 @@ def _years(connection: Connection) -> None:
     )
 
 
+def _workers(connection: Connection) -> None:
+    """Add who does a job, the number of the attempt, and when it was last heard of."""
+    _run(
+        connection,
+        """
+        ALTER TABLE job ADD COLUMN attempt INTEGER NOT NULL DEFAULT 0;
+        ALTER TABLE job ADD COLUMN worker TEXT;
+        ALTER TABLE job ADD COLUMN beat_us INTEGER;
+        ALTER TABLE job ADD COLUMN cancel INTEGER NOT NULL DEFAULT 0;
+        """,
+    )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
@@ -294,6 +307,7 @@ STEPS: tuple[tuple[str, Step], ...] = (
     ("clocks", _clocks),
     ("alarms", _alarms),
     ("years", _years),
+    ("workers", _workers),
 )
 
 

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.store import migrations
 from service.store.connection import Connection
 from service.store.errors import StoreError
-from service.store.lock import FileLock
+from service.store.sqlite import migrations
+from service.store.sqlite.lock import FileLock
 
 
 @dataclass(frozen=True)

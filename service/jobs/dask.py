@@ -1,0 +1,104 @@
+"""Tasks on a Dask cluster. What is true stands in the database: a cluster that goes away loses nothing but time."""
+
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from distributed import Client, get_worker
+
+from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed
+from twin_core.errors import TwinError
+
+T = TypeVar("T")
+
+POLL_S = 0.2
+AWAY_S = 15.0
+"""A scheduler that has been away for so long is given up; its tasks are put back."""
+CONNECT_S = 10.0
+
+
+class DaskTasks:
+    """Runs ``function(*args, progress=...)`` on the workers of a Dask scheduler, at most so many at a time."""
+
+    def __init__(self, address: str, max_workers: int, deadline_s: float) -> None:
+        """Connect with the first task; one that runs longer than ``deadline_s`` is ended."""
+        self._address, self._deadline_s = address, deadline_s
+        self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix="dask")
+        self._closing = Cancel()
+        self._lock = threading.Lock()
+        self._client: Client | None = None
+
+    def start(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> "Future[T]":
+        """Queue a task; ``progress`` is called in a thread of this process."""
+        return self._threads.submit(self._supervise, (function, args, kwargs), progress, cancel)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End every task and let go of the cluster."""
+        self._closing.request()
+        self._threads.shutdown(wait=wait, cancel_futures=True)
+        with self._lock:
+            if self._client is not None:
+                self._client.close(timeout=2)
+
+    def _connected(self) -> Client:
+        with self._lock:
+            if self._client is None or self._client.status not in ("running", "connecting"):
+                try:
+                    self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False)
+                except OSError as error:
+                    raise ExecutorLost(f"no scheduler answers at {self._address}") from error
+            return self._client
+
+    def _supervise(self, call: tuple[Any, ...], progress: Callable[[float, str], None], cancel: Cancel) -> Any:
+        client = self._connected()
+        topic = f"twin-{uuid.uuid4().hex}"
+        future = client.get_executor(pure=False, retries=2).submit(_run, topic, *call)
+        client.subscribe_topic(topic, lambda event: progress(*event[1]))
+        deadline_s = time.monotonic() + self._deadline_s
+        seen_s = time.monotonic()
+        try:
+            while not future.done():
+                if cancel.requested or self._closing.requested:
+                    raise JobCancelled
+                if time.monotonic() > deadline_s:
+                    raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+                if client.status == "running":
+                    seen_s = time.monotonic()
+                elif time.monotonic() - seen_s > AWAY_S:
+                    raise ExecutorLost(f"the scheduler at {self._address} went away")
+                time.sleep(POLL_S)
+            if future.cancelled():
+                raise ExecutorLost(f"the scheduler at {self._address} forgot a task")
+            kind, *rest = future.result()
+        except (OSError, RuntimeError) as error:
+            raise ExecutorLost(f"{type(error).__name__}: {error}") from error
+        finally:
+            future.cancel()
+        if kind == "failed":
+            raise JobFailed(*rest)
+        return rest[0]
+
+
+def _run(topic: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
+    """Do the task in a worker of the cluster; what went wrong comes back as a value, so that it is not tried again."""
+    worker = get_worker()
+
+    def progress(fraction: float, message: str) -> None:
+        worker.log_event(topic, (float(fraction), str(message)))
+
+    try:
+        return ("done", function(*args, progress=progress, **kwargs))
+    except TwinError as error:
+        return ("failed", str(error))
+    except Exception as error:
+        return ("failed", f"{type(error).__name__}: {error}")

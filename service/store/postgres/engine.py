@@ -1,0 +1,210 @@
+"""A PostgreSQL server: connections that speak the store's dialect, and transactions that many processes share."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import psycopg
+from psycopg import errors
+
+from service.store.connection import Connection, Cursor
+from service.store.errors import DiskFull, StoreError, Unavailable
+from service.store.postgres.migrations import migrate
+
+log = logging.getLogger("service.store")
+T = TypeVar("T")
+
+CONNECT_S = 5
+RETRY_S = 1.0
+"""After a server could not be reached, writes are refused for so long before the next attempt."""
+SETTINGS = {
+    "application_name": "thermal-twin",
+    "connect_timeout": CONNECT_S,
+    "keepalives_idle": 5,
+    "keepalives_interval": 2,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 8000,
+}
+OPTIONS = "-c synchronous_commit=on -c idle_in_transaction_session_timeout=60000 -c lock_timeout=20000"
+"""A client that vanishes inside a transaction holds its locks no longer than that."""
+
+
+class Speaking:
+    """A connection of the driver that takes the store's dialect."""
+
+    def __init__(self, driver: "psycopg.Connection[Any]") -> None:
+        """Take over an open connection."""
+        self.driver = driver
+
+    def execute(self, query: str, parameters: Sequence[Any] = (), /) -> Cursor:
+        """Run one statement."""
+        return self.driver.execute(_translated(query), parameters, binary=True)  # type: ignore[arg-type]
+
+    def executemany(self, query: str, parameters: Iterable[Sequence[Any]], /) -> Cursor:
+        """Run one statement once for each row of parameters."""
+        cursor = self.driver.cursor(binary=True)
+        cursor.executemany(_translated(query), parameters)  # type: ignore[arg-type]
+        return cursor
+
+
+@lru_cache(maxsize=512)
+def _translated(query: str) -> str:
+    """Return a statement with the driver's placeholders; none of the store's statements holds a question mark in a text."""
+    return query.replace("%", "%%").replace("?", "%s")
+
+
+def connect(url: str, *, read_only: bool = False, autocommit: bool = True) -> "psycopg.Connection[Any]":
+    """Return a connection of the driver; Unavailable if the server cannot be reached, without what is secret of the URL."""
+    try:
+        own = psycopg.conninfo.conninfo_to_dict(url).get("options", "")
+        options = f"{OPTIONS}{' -c default_transaction_read_only=on' if read_only else ''} {own}"
+        return psycopg.connect(url, autocommit=autocommit, options=options, **SETTINGS)  # type: ignore[arg-type]
+    except (psycopg.OperationalError, psycopg.ProgrammingError) as error:
+        raise Unavailable(f"the database cannot be reached: {_without_secrets(error, url)}") from None
+
+
+def _without_secrets(error: Exception, url: str) -> str:
+    """Return the last line of an error without the password, wherever it stands."""
+    said = " ".join(str(error).split())
+    try:
+        password = psycopg.conninfo.conninfo_to_dict(url).get("password")
+    except psycopg.ProgrammingError:
+        return "it is no URL of a PostgreSQL database"
+    return (said.replace(str(password), "***") if password else said)[:300]
+
+
+class PostgresSession:
+    """The connection that writes; it is made anew when the server comes back."""
+
+    def __init__(self, url: str) -> None:
+        """Connect; Unavailable if the server cannot be reached."""
+        self._url = url
+        self._speaking = Speaking(connect(url))
+        self._not_before_s = 0.0
+
+    @property
+    def connection(self) -> Connection:
+        """What operations are handed."""
+        return self._speaking
+
+    @property
+    def in_transaction(self) -> bool:
+        """Whether the connection lives: a fault inside of a savepoint leaves the transaction open."""
+        return not self._speaking.driver.broken and not self._speaking.driver.closed
+
+    def begin(self, twins: Collection[int]) -> None:
+        """Begin a transaction and lock the heads of these twins, in one order everywhere so that nobody waits in a circle."""
+        if not self.in_transaction:
+            self._connect()
+        self._speaking.execute("BEGIN")
+        if twins:
+            query = "SELECT 1 FROM head WHERE twin = ANY(?) ORDER BY twin FOR UPDATE"
+            self._speaking.execute(query, (sorted(twins),))
+
+    def commit(self) -> None:
+        """Make it durable."""
+        self._speaking.execute("COMMIT")
+
+    def roll_back(self) -> None:
+        """Undo it; a connection that cannot even do that is given up."""
+        try:
+            self._speaking.execute("ROLLBACK")
+        except psycopg.Error:
+            self._speaking.driver.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._speaking.driver.close()
+
+    def _connect(self) -> None:
+        if time.monotonic() < self._not_before_s:
+            raise Unavailable("the database cannot be reached; send it again")
+        self._not_before_s = time.monotonic() + RETRY_S
+        self._speaking = Speaking(connect(self._url))
+        log.warning("the database is there again")
+
+
+class PostgresEngine:
+    """One database of a server."""
+
+    faults: tuple[type[Exception], ...] = (psycopg.Error,)
+    is_shared = True
+    chores: tuple[tuple[str, Callable[[Connection], int]], ...] = ()
+
+    def __init__(self, url: str) -> None:
+        """Connect and migrate; StoreError if that is impossible."""
+        self.url = url
+        self._local = threading.local()
+        self._opened: list[psycopg.Connection[Any]] = []
+        try:
+            with connect(url) as driver:
+                migrate(Speaking(driver))
+        except Unavailable as error:
+            raise StoreError(f"TWIN_DATABASE_URL: {error.detail}") from None
+        except psycopg.Error as error:
+            said = _without_secrets(error, url)
+            raise StoreError(f"TWIN_DATABASE_URL: the database cannot be used ({said})") from None
+
+    def session(self) -> PostgresSession:
+        """Return the session that writes."""
+        try:
+            return PostgresSession(self.url)
+        except Unavailable as error:
+            raise StoreError(f"TWIN_DATABASE_URL: {error.detail}") from None
+
+    def read(self, operation: Callable[[Connection], T]) -> T:
+        """Run an operation on a snapshot; once more if the connection turns out to be dead."""
+        try:
+            return self._read(operation)
+        except psycopg.OperationalError:
+            return self._read_anew(operation)
+
+    def _read_anew(self, operation: Callable[[Connection], T]) -> T:
+        try:
+            return self._read(operation)
+        except psycopg.OperationalError as error:
+            raise self.refusal(error) from None
+
+    def _read(self, operation: Callable[[Connection], T]) -> T:
+        speaking: Speaking | None = getattr(self._local, "connection", None)
+        if speaking is None or speaking.driver.closed or speaking.driver.broken:
+            speaking = self._local.connection = Speaking(connect(self.url, read_only=True))
+            self._opened.append(speaking.driver)
+        speaking.execute("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY")
+        try:
+            return operation(speaking)
+        finally:
+            try:
+                speaking.execute("ROLLBACK")
+            except psycopg.Error:
+                speaking.driver.close()
+
+    def is_passing(self, error: Exception) -> bool:
+        """Return whether transactions stood in each other's way."""
+        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure)
+
+    def refusal(self, error: Exception) -> Exception:
+        """Return what the caller is told about a fault."""
+        if isinstance(error, errors.DiskFull):
+            log.error("the database's disk is full; nothing of the write was stored")
+            return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
+        if isinstance(error, psycopg.OperationalError | errors.ReadOnlySqlTransaction):
+            log.error("the database does not answer", extra={"reason": _without_secrets(error, self.url)})
+            return Unavailable("the database cannot be reached; send it again: what is stored already is recognised")
+        return error
+
+    def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
+        """Let each sequence go on behind the rows that were copied."""
+        for table, column in keys.items():
+            query = (
+                f"SELECT setval(pg_get_serial_sequence('{table}', '{column}'), greatest(max({column}), 1)) FROM {table}"
+            )
+            connection.execute(query)
+
+    def close(self) -> None:
+        """Close the readers' connections."""
+        for driver in self._opened:
+            driver.close()

@@ -1,0 +1,142 @@
+"""The file: its locks, its connections and how they are set up."""
+
+import contextlib
+import logging
+import sqlite3
+import threading
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from service.instants import now_us
+from service.store.connection import Connection
+from service.store.errors import DiskFull, StoreError
+from service.store.sqlite.lock import FileLock
+from service.store.sqlite.migrations import migrate
+from service.store.sqlite.vacuum import vacuum
+
+log = logging.getLogger("service.store")
+T = TypeVar("T")
+
+PRAGMAS = (
+    "auto_vacuum = INCREMENTAL",  # holds for new files; others keep what they were made with
+    "journal_mode = WAL",
+    "synchronous = FULL",
+    "foreign_keys = ON",
+    "mmap_size = 268435456",
+    "temp_store = MEMORY",
+)
+FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
+
+
+class SqliteSession:
+    """The only connection that writes."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        """Take over an open connection."""
+        self.connection = connection
+
+    @property
+    def in_transaction(self) -> bool:
+        """Whether a transaction is open."""
+        return self.connection.in_transaction
+
+    def begin(self, twins: Collection[int]) -> None:
+        """Begin a transaction; nobody else writes at all."""
+        self.connection.execute("BEGIN IMMEDIATE")
+
+    def commit(self) -> None:
+        """Make it durable."""
+        self.connection.execute("COMMIT")
+
+    def roll_back(self) -> None:
+        """Undo it, if there is one."""
+        if self.connection.in_transaction:
+            with contextlib.suppress(sqlite3.Error):  # the commit's own error is the one to report
+                self.connection.execute("ROLLBACK")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connection.close()
+
+
+class SqliteEngine:
+    """One database file, locked against other servers."""
+
+    faults: tuple[type[Exception], ...] = (sqlite3.Error,)
+    is_shared = False
+    chores: tuple[tuple[str, Callable[[Connection], int]], ...] = (("free pages", vacuum),)
+
+    def __init__(self, path: Path) -> None:
+        """Lock, open and migrate the file; StoreError if that is impossible."""
+        self._path = path
+        self._lock = FileLock(path)
+        self._local = threading.local()
+        self._opened: list[sqlite3.Connection] = []
+        try:
+            self._writer = _open(path)
+        except sqlite3.Error as error:
+            self._lock.release()
+            raise StoreError(f"{path}: cannot be used as a database ({error}); check TWIN_DATABASE_URL") from error
+
+    def session(self) -> SqliteSession:
+        """Return the session that writes."""
+        return SqliteSession(self._writer)
+
+    def read(self, operation: Callable[[Connection], T]) -> T:
+        """Run an operation on a snapshot, on a connection of the calling thread's own."""
+        connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
+        if connection is None:
+            connection = _connect(self._path, read_only=True)
+            self._local.connection = connection
+            self._opened.append(connection)
+        connection.execute("BEGIN")
+        try:
+            return operation(connection)
+        finally:
+            connection.execute("ROLLBACK")
+
+    def is_passing(self, error: Exception) -> bool:
+        """Return False: nobody else writes."""
+        return False
+
+    def refusal(self, error: Exception) -> Exception:
+        """Return what the caller is told about a failed write."""
+        name = getattr(error, "sqlite_errorname", "")
+        if name.startswith(FULL):
+            log.error("the disk is full; nothing of the write was stored", extra={"sqlite": name})
+            return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
+        return error
+
+    def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
+        """Do nothing: SQLite looks at the rows itself."""
+
+    def close(self) -> None:
+        """Close the readers' connections and release the file."""
+        for connection in self._opened:
+            connection.close()
+        self._lock.release()
+
+
+def _open(path: Path) -> sqlite3.Connection:
+    """Return the writer's connection to a database of the present schema."""
+    connection = _connect(path)
+    try:
+        migrate(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
+    connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
+    connection.create_function("clock_us", 0, now_us)
+    settings = PRAGMAS + (("query_only = ON",) if read_only else ())
+    try:
+        for setting in settings:
+            connection.execute(f"PRAGMA {setting}")
+    except sqlite3.Error:
+        connection.close()
+        raise
+    return connection
