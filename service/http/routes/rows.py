@@ -73,7 +73,7 @@ async def forecast_rows(
 
     Nothing where ``stop`` is past.
     """
-    _, position = await forecasts.state_of(service.live.tracker(twin))
+    _, position = await forecasts.state_of(service.live.state(twin))
     stop_us = parse_parameter(stop, "stop") if stop is not None else now_us() + 3_600_000_000
     horizon_s = (stop_us - position.time_us) / 1e6
     if horizon_s <= 0.0:
