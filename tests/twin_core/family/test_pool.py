@@ -112,10 +112,10 @@ def test_an_odd_one_is_called_different_and_nobody_else(one: CalibratedModel) ->
 def test_a_new_sibling_begins_with_what_the_family_knows(one: CalibratedModel) -> None:
     family = pool(siblings(one, 10))
     network = build_network(declared(one.spec, family), ())
-    for name, mean, spread in zip(family.names, family.mean, family.spread, strict=True):
+    for name, mean, spread, error in zip(family.names, family.mean, family.spread, family.mean_std, strict=True):
         parameter = network.parameters.parameters[network.parameters.index[name]]
         assert parameter.value == pytest.approx(np.exp(mean))
-        assert parameter.prior_std is not None and spread <= parameter.prior_std < 0.05
+        assert parameter.prior_std == pytest.approx(np.hypot(spread, error))
 
 
 def test_a_family_has_three_members_of_one_design(one: CalibratedModel) -> None:
