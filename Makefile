@@ -8,7 +8,7 @@ GROUND := $(VENV)/.ground
 DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
+.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -24,6 +24,7 @@ $(BENCH): $(STAMP)
 $(GROUND): $(STAMP)
 	$(BIN)/pip install --quiet --editable ".[dev,neural,ground]"
 	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/openmct openmct@4
+	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/grafana @grafana/schema typescript
 	touch $@
 
 $(DOCS): $(STAMP)
@@ -69,6 +70,11 @@ bench-loop: $(BENCH)
 	$(BIN)/python -m benchmarks.loop
 	$(BIN)/python -m benchmarks.band_study
 	$(BIN)/python -m benchmarks.loop_rivals
+
+# Cases of two seeds, three of every group; the full suite takes a day on two cores.
+bench-ablation: $(BENCH)
+	for seed in 1000 5000; do $(BIN)/python -m benchmarks.cases --out ablation-cases --first-seed $$seed --limit 3 --networks 1; done
+	$(BIN)/python -m benchmarks.ablation --cases ablation-cases
 
 bench-decoys: $(BENCH)
 	$(BIN)/python -m benchmarks.decoys

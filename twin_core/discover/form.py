@@ -62,10 +62,9 @@ def _free_forms(trial: Trial, effects: Sequence[Effect], needed: float) -> tuple
     layout = trial.fit.network.layout
     nodes = {node for effect in effects for node in touched_nodes(effect, layout)}
     n_tried, best = 1, dict[object, tuple[float, Effect]]()
-    for screening in screened(trial, trial.fit, LATENT_SHARES, fallback=True):
-        probes = [probe for probe in screening.probes if probe.effect.where["node"] in nodes]
-        n_tried = max(n_tried, len({probe.effect.place for probe in probes}))
-        for probe in probes:
+    for screening in screened(trial, trial.fit, LATENT_SHARES, fallback=True, nodes=nodes):
+        n_tried = max(n_tried, len({probe.effect.place for probe in screening.probes}))
+        for probe in screening.probes:
             worth, form = schwarz_gain(probe, trial.n_samples), (probe.effect.place, len(probe.effect.amplitudes))
             if probe.gain > needed and worth > best.get(form, (-np.inf, probe.effect))[0]:
                 best[form] = worth, probe.effect

@@ -1,6 +1,8 @@
 """Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -52,8 +54,6 @@ class Finding:
 
     judged: Judged
     alternatives: tuple[Judged, ...] = ()
-    explained: float = np.inf
-    """Variance of open-loop residuals that they explain, in units of the sensors' noise, mean over sensors."""
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -164,7 +164,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
                 j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
             ]
             close = tuple(j for j in elsewhere if is_close(j, best))
-            state.findings.append(Finding(own, close, mean_excess(state.trial) - mean_excess(best.trial)))
+            state.findings.append(Finding(own, close))
             state.trial = best.trial
             state.rejected += refused
             return True
@@ -189,11 +189,12 @@ def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, boo
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
     """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
     named = [effect for effect in judged.effects if not effect.fallback]
+    if not named:
+        return False
     most = most_left(judged.evidence.log_bayes_factor, needed)
-    return bool(named) and (
-        leaves_a_repeatable_heat(judged.trial, named, needed, most)
-        or outdone_by_a_free_form(simple, judged.trial, named, needed, most)
-    )
+    with ThreadPoolExecutor(1) as pool:  # side by side, under the same deadline
+        other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, judged.trial, named, needed, most)
+        return leaves_a_repeatable_heat(judged.trial, named, needed, most) or other.result()
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

@@ -18,7 +18,6 @@ from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
     NO_MORE,
-    Finding,
     Judged,
     Search,
     accept,
@@ -222,78 +221,83 @@ def _judge(
 
 
 def withdraw(state: Search) -> None:
-    """Withdraw findings that explain no more than a lumped network may leave: both may be its coarseness.
+    """Withdraw what explains no more than a lumped network may leave: both may be its coarseness.
 
+    A finding must explain more than what stays beside it, and each of its effects more than any coarse network may have left.
     Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
     counts as unexplained, unless the others explain it too.
     """
     while state.findings:
-        weakest = min(state.findings, key=lambda finding: finding.explained)
-        is_named = not all(effect.fallback for effect in weakest.effects)
-        if weakest.explained >= least_explained(mean_excess(state.trial), state.trial.n_samples, is_named=is_named):
+        left, n_readings = mean_excess(state.trial), state.trial.n_samples
+        if left <= by_chance(n_readings):
             return
-        state.findings = [finding for finding in state.findings if finding is not weakest]
-        state.rejected.append(replace(weakest.judged, reason=NO_MORE))
-        places = {effect.place for effect in weakest.effects}
-        work = partial(_without, state, places)
-        kept = state.attempt(work, "the model without what explains no more than what stays")
-        if kept is None:
-            state.findings, kept = [], state.base
-        state.trial = kept
-        state.findings = [_explaining(state, finding) for finding in state.findings]
+        asked: dict[frozenset[object], float] = {}
+        for finding in state.findings:
+            places = frozenset(effect.place for effect in finding.effects)
+            is_named = not all(effect.fallback for effect in finding.effects)
+            asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
+            asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
+        without = {places: _attempted_without(state, places) for places in asked}
+        told = {places: (mean_excess(kept[0]) - left) / asked[places] for places, kept in without.items() if kept}
+        weakest = min(told, key=lambda places: told[places], default=None)
+        if weakest is None or told[weakest] >= 1.0:
+            return
+        for finding in state.findings:
+            effects = tuple(effect for effect in finding.effects if effect.place in weakest)
+            if effects:
+                state.rejected.append(replace(finding.judged, effects=effects, reason=NO_MORE))
+        kept = without[weakest]
+        assert kept is not None
+        _drop(state, weakest, *kept)
 
 
-def least_explained(left: float, n_readings: int, *, is_named: bool) -> float:
-    """Return the variance that a finding must explain beside what stays unexplained, both in units of the sensors' noise.
+def by_chance(n_readings: int) -> float:
+    """Return the variance, in units of the sensors' noise, up to which what stays of so many readings is chance."""
+    return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
 
-    That a network is coarse at all is seen where more stays than chance leaves of ``n_readings`` independent readings, whose
-    variance has a standard error of sqrt(2 / n). A heat without a name claims nothing but to predict: all that stays counts.
+
+def least_explained(beside: float, left: float, n_readings: int) -> float:
+    """Return the variance that names must explain, in units of the sensors' noise.
+
+    Parameters
+    ----------
+    beside
+        What counts as left beside them.
+    left
+        What stays unexplained. Where that is more than chance leaves of ``n_readings`` independent readings, whose variance has
+        a standard error of sqrt(2 / n), the network is seen to be coarse.
+    n_readings
+        How many there are.
     """
-    if not is_named:
-        return policy.DOMINANCE * left
-    by_chance = policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
-    shown = min(max(left / by_chance - 1.0, 0.0), 1.0)
-    return policy.DOMINANCE * min(max(left, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
-
-
-def _explaining(state: Search, finding: Finding) -> Finding:
-    """Return a finding with what it explains beside the others as they are now; as it is where that cannot be told."""
-    work = partial(_without, state, {effect.place for effect in finding.effects})
-    without = state.attempt(work, f"the model without {finding.judged.labels}")
-    if without is None:
-        return finding
-    return replace(finding, explained=mean_excess(without) - mean_excess(state.trial))
-
-
-def _without(state: Search, places: Collection[object]) -> Trial:
-    """Return the state's trial without the effects at some places."""
-    others = [effect for effect in state.trial.effects if effect.place not in places]
-    return try_effects(state.trial, others, n_passes=10) if others else state.base
+    shown = min(max(left / by_chance(n_readings) - 1.0, 0.0), 1.0)
+    return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
 
 
 def prune(state: Search, needed: float) -> None:
     """Drop findings, and members of a set that was found together, that the others have made superfluous."""
     for finding in list(state.findings):
         for effect in finding.effects if len(finding.effects) > 1 or finding is not state.findings[-1] else ():
-            _drop(state, effect.place, needed)
+            if all(other.place == effect.place for other in state.trial.effects):
+                continue
+            kept = _attempted_without(state, {effect.place})
+            if kept is not None and kept[1] <= needed:
+                _drop(state, {effect.place}, *kept)
 
 
-def _drop(state: Search, place: object, needed: float) -> None:
-    """Drop the effect at a place if the model without it is hardly less likely."""
-    if all(effect.place == place for effect in state.trial.effects):
-        return
-    found = state.attempt(partial(_weighed_without, state, place), f"the model without {place}")
-    if found is None:
-        return
-    without, worth_of_it = found
-    if worth_of_it > needed:
-        return
+def _attempted_without(state: Search, places: Collection[object]) -> tuple[Trial, float] | None:
+    """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed."""
+
+    def weighed() -> tuple[Trial, float]:
+        others = [effect for effect in state.trial.effects if effect.place not in places]
+        without = try_effects(state.trial, others, n_passes=10) if others else state.base
+        return without, weigh(without, state.trial, 1).log_bayes_factor
+
+    return state.attempt(weighed, "the model without " + " and ".join(str(place) for place in places))
+
+
+def _drop(state: Search, places: Collection[object], without: Trial, lost: float) -> None:
+    """Go on without the effects at places, whose log Bayes factor was ``lost``."""
     state.trial = without
-    state.findings = [f.without(place, worth_of_it, without) for f in state.findings]
+    for place in places:
+        state.findings = [f.without(place, lost, without) for f in state.findings]
     state.findings = [f for f in state.findings if f.effects]
-
-
-def _weighed_without(state: Search, place: object) -> tuple[Trial, float]:
-    """Return the trial without the effect at a place, and the log Bayes factor of what was dropped."""
-    without = _without(state, {place})
-    return without, weigh(without, state.trial, 1).log_bayes_factor

@@ -1,6 +1,6 @@
 """The shortlist: every candidate of the registry, screened, and the few that are worth a refit."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -17,8 +17,13 @@ N_VARIED = 4
 """Places at the head of the shortlist that are tried from more than one start."""
 
 
-def candidates(trial: Trial, fit: HeatFit, *, fallback: bool) -> tuple[Survey, list[Effect]]:
-    """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks."""
+def candidates(
+    trial: Trial, fit: HeatFit, *, fallback: bool, nodes: Collection[str] | None = None
+) -> tuple[Survey, list[Effect]]:
+    """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks.
+
+    With ``nodes`` only those with one of them for their ``node``.
+    """
     survey = survey_of(fit)
     taken = {effect.place for effect in trial.effects}
     effects = [
@@ -26,18 +31,21 @@ def candidates(trial: Trial, fit: HeatFit, *, fallback: bool) -> tuple[Survey, l
         for kind in REGISTRY.values()
         if kind.fallback == fallback
         for where in kind.places(survey.layout)
+        if nodes is None or where["node"] in nodes
         for effect in kind.starts(where, survey)
         if effect.place not in taken
     ]
     return survey, effects
 
 
-def screened(trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: bool) -> list[Screening]:
-    """Screen the candidates of a trial about a fit, once per assumed size of the latent heat.
+def screened(
+    trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: bool, nodes: Collection[str] | None = None
+) -> list[Screening]:
+    """Screen the candidates of a trial about a fit, at some nodes or everywhere, once per assumed size of the latent heat.
 
     As fitted, the latent heat explains everything a little; smaller, it is as it would be with the right effect in place.
     """
-    survey, effects = candidates(trial, fit, fallback=fallback)
+    survey, effects = candidates(trial, fit, fallback=fallback, nodes=nodes)
     return screen_sizes(fit, shares, survey, effects)
 
 

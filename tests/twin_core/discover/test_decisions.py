@@ -186,8 +186,6 @@ def test_what_is_accepted(options: list[Judged], named: str | None, reasons: lis
     assert accept(state, options, NEEDED) == (named is not None)
     assert [f.effects[0].where["node"] for f in state.findings] == ([] if named is None else [named])
     assert [j.reason for j in state.rejected] == reasons
-    if named is not None:
-        assert state.findings[0].explained == pytest.approx(9.0)
 
 
 @pytest.mark.parametrize(
@@ -224,20 +222,48 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
         return stub(*effects, left=left + sum(value for name, value in own.items() if name not in names))
 
     monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
-    state.findings = [Finding(judged(name, 50.0), (), value) for name, value in own.items()]
+    state.findings = [Finding(judged(name, 50.0)) for name in own]
     withdraw(state)
     assert [f.effects[0].where["node"] for f in state.findings] == kept
     assert [e.where["node"] for e in state.trial.effects] == kept
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
+@pytest.mark.parametrize(
+    ("own", "kept"),
+    [((DOMINANCE * LEAST - JUST, 90.0), ["n1"]), ((DOMINANCE * LEAST, DOMINANCE * LEAST), ["n0", "n1"])],
+    ids=["one too little", "both enough"],
+)
+def test_of_effects_found_together_each_must_explain_something(
+    monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], kept: list[str]
+) -> None:
+    """Both together explain enough, in a network that is hardly seen to be coarse."""
+    parts, left = {"n0": own[0], "n1": own[1]}, 2.0 * CHANCE
+
+    def refitted(effects: tuple[Effect, ...]) -> Trial:
+        names = {e.where["node"] for e in effects}
+        return stub(*effects, left=left + sum(value for name, value in parts.items() if name not in names))
+
+    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    both = (load("n0"), load("n1"))
+    state = Search(refitted(both), refitted(()))
+    state.findings = [Finding(Judged(both, Evidence(50.0, 0.0), state.trial))]
+    withdraw(state)
+    assert [effect.where["node"] for finding in state.findings for effect in finding.effects] == kept
+
+
 @pytest.mark.parametrize(("explained", "stands"), [(DOMINANCE * 50.0, True), (DOMINANCE * 50.0 - JUST, False)])
-def test_beside_a_heat_without_a_name_all_that_stays_counts(explained: float, stands: bool) -> None:
+def test_beside_a_heat_without_a_name_all_that_stays_counts(
+    monkeypatch: pytest.MonkeyPatch, explained: float, stands: bool
+) -> None:
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     free = unnamed()
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
     state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
-    state.findings = [Finding(option, (), explained)]
+    state.findings = [Finding(option)]
     withdraw(state)
     assert bool(state.findings) == stands
 
@@ -261,7 +287,7 @@ def test_a_correction_does_not_make_its_own_trajectories_less_likely(
 @given(st.floats(0.0, 1e6), st.floats(1.0, 2.0), st.integers(10, 10**7))
 def test_what_a_name_must_explain_grows_with_what_stays_without_a_cliff(left: float, factor: float, n: int) -> None:
     """It never grows faster than it does where a network begins to be seen as coarse."""
-    least, more = (least_explained(value, n, is_named=True) for value in (left, left * factor))
+    least, more = (least_explained(value, value, n) for value in (left, left * factor))
     steepest = DOMINANCE * max(1.0, LEAST / (VISIBLE_COARSENESS * np.sqrt(2.0 / n)))
     assert 0.0 <= least <= more <= DOMINANCE * MOST
     assert more - least <= steepest * (factor - 1.0) * left * (1.0 + 1e-9)
