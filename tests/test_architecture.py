@@ -18,7 +18,7 @@ ROOMS = (
     "interchange",
     *("effects", "simulate", "latent_force"),
     "calibrate",
-    *("assimilate", "anomaly", "forecast", "flows", "fmu", "discover"),
+    *("assimilate", "anomaly", "forecast", "flows", "fmu", "discover", "family"),
 )
 """The rooms of twin_core from left to right: each may use only those before it."""
 
