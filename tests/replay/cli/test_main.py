@@ -19,6 +19,7 @@ def test_the_commands() -> None:
         *(
             "backup",
             "balance",
+            "bridge",
             "calibrate",
             "check",
             "check-effect",
