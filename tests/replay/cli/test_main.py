@@ -24,6 +24,7 @@ def test_the_commands() -> None:
             "check",
             "check-effect",
             "close-loop",
+            "convert",
             "correlate",
             "demo",
             "export",
