@@ -129,7 +129,7 @@ def measure(n_nodes: int, n_times: int, n_live: int) -> tuple[list[str], list[st
         begun = time.perf_counter()
         tally = bridge().run(once=True)
         into_twin = tally.accepted * (n_nodes + 1) / (time.perf_counter() - begun)
-        job = client.wait(config.twin, client.calibrate(config.twin, samples=500))
+        job = client.wait(config.twin, client.calibrate(config.twin, samples=300))
         assert job.state == "succeeded", job.message
         while client.twin(config.twin).catching_up:
             time.sleep(0.2)
@@ -165,7 +165,7 @@ def live(bridge: YamcsBridge, config: YamcsConfig, gateway: YamcsGateway, rows: 
 
 def main() -> None:
     """Measure, print and save."""
-    results = [measure(n_nodes, 2000, 40) for n_nodes in (2, 10, 30)]
+    results = [measure(n_nodes, 1000, 40) for n_nodes in (2, 10, 20)]
     rates = markdown_table(
         [
             "sensors",
@@ -180,7 +180,7 @@ def main() -> None:
         ["sensors", "samples", "median, ms", "95 %, ms", "longest, ms"], [delay for _, delay in results]
     )
     note = (
-        "Rates: the archive of 2000 samples through the bridge into an empty twin (log-in, reading back and health included); "
+        "Rates: the archive of 1000 samples through the bridge into an empty twin (log-in, reading back and health included); "
         "residuals, forecasts and events of all of them back; what the parameter stream takes by itself; the same with one "
         "request per value. Delay: from a sample being sent to Yamcs to its residual being heard from Yamcs, through the "
         "bridge (`--poll 0.1`), the service's commit and its filter; one sample every 0.5 s, which is twenty times as fast as "
