@@ -155,7 +155,7 @@ def look(folder: Path, service: Server, client: Any) -> None:
         page.open(f"{url}/?start=2026-03-01T00:00:00Z&stop=2026-03-02T00:00:00Z")
         for name in ("Thermal twins", "demo"):
             page.click(f'[aria-label^="Expand {name} "]')
-        page.click('.c-tree [aria-label^="Navigate to T_box Overlay Plot"]')
+        page.click('.c-tree [aria-label^="Navigate to T_box "]')
         for name in ("T_box measured K", "T_box forecast K", "T_box forecast, 95 % K"):
             page.until(f"document.body.innerText.includes({json.dumps(name)})")
         ask = (
