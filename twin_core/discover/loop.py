@@ -10,10 +10,10 @@ from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE, attempted
-from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.confirm import Trial
 from twin_core.discover.dossier import provenance

@@ -25,8 +25,8 @@ SOLVERS = (
     "twin_core.gp.noise_model.minimize",
     "twin_core.simulate.rollout.march",
     "twin_core.calibrate.problem.sensitivities",
-    "twin_core.calibrate.latent_heat.one_step",
-    "twin_core.calibrate.latent_heat.sensitivities",
+    "twin_core.calibrate.undeclared.model.one_step",
+    "twin_core.calibrate.undeclared.model.sensitivities",
 )
 """Every solver and factorisation that a search calls."""
 
