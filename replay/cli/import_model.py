@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from replay.cli.command import FILE, Command
+from replay.cli.durations import POSITIVE_DURATION
 
 if TYPE_CHECKING:
     from twin_core.interchange.imported import Imported
@@ -46,6 +47,13 @@ FORMATS = ("xija", "esatan", "sinda")
     show_default=True,
     help="Factor by which a fitted number may be off, one standard deviation (Xija models).",
 )
+@click.option(
+    "--over-time", is_flag=True, help="Read the course of heat rates over the orbit, not their averages (SINDA)."
+)
+@click.option("--inputs", type=FILE, help="CSV to write: what the model says of heats that go over time.")
+@click.option(
+    "--duration", type=POSITIVE_DURATION, help="How long --inputs is: seconds, or 1d.  [default: the longest of them]"
+)
 @click.option("--skip-unknown", is_flag=True, help="Write what was understood, and list what was not.")
 @click.option("--json", "as_json", is_flag=True, help="Print notes and refusals as JSON.")
 def import_model(
@@ -57,6 +65,9 @@ def import_model(
     hidden: tuple[str, ...],
     held: bool,
     spread: float,
+    over_time: bool,
+    inputs: Path | None,
+    duration: float | None,
     skip_unknown: bool,
     as_json: bool,
 ) -> None:
@@ -76,7 +87,9 @@ def import_model(
     if kind != "sinda" and len(files) > 1:
         raise click.UsageError(f"{files[1]}: only a SINDA deck has several files")
     columns, values = _pairs(channels, "channel"), _pairs(constants, "constant")
-    found = _read(kind, texts, columns, values, hidden, held, spread)
+    if over_time and kind != "sinda":
+        raise click.UsageError("--over-time belongs to SINDA decks; other tools' arrays over time are always read")
+    found = _read(kind, texts, columns, values, hidden, held, spread, over_time)
     refused = list(found.refused)
     if refused and not skip_unknown:
         raise SpecError(
@@ -84,6 +97,8 @@ def import_model(
         )
     spec = load_spec(found.data)
     _write(out, found)
+    if inputs is not None:
+        _write_inputs(inputs, found, duration)
     told = {"notes": list(found.notes), "left_out": refused}
     if as_json:
         print_line(to_json({"twin": spec.twin, "nodes": len(spec.nodes), **told}).rstrip())
@@ -124,6 +139,7 @@ def _read(
     hidden: tuple[str, ...],
     held: bool,
     spread: float,
+    over_time: bool,
 ) -> "Imported":
     file, text = next(iter(texts.items()))
     if kind == "xija":
@@ -142,7 +158,21 @@ def _read(
         return read_esatan(text, str(file), channels=channels, held=held)
     from twin_core.interchange.sinda import read_sinda
 
-    return read_sinda({str(name): deck for name, deck in texts.items()}, channels=channels, held=held)
+    return read_sinda(
+        {str(name): deck for name, deck in texts.items()}, channels=channels, held=held, over_time=over_time
+    )
+
+
+def _write_inputs(out: Path, found: "Imported", duration_s: float | None) -> None:
+    from twin_core.errors import SpecError
+    from twin_core.interchange.imported import over_time
+    from twin_core.telemetry import Record
+    from twin_core.telemetry_csv import write_columns
+
+    if not found.courses:
+        raise SpecError(f"{out}: the model has no heats that go over time")
+    time_s, columns = over_time(found.courses, duration_s)
+    write_columns(out, Record(time_s, columns), dict.fromkeys(columns, "W"))
 
 
 def _write(out: Path, found: "Imported") -> None:

@@ -1,7 +1,8 @@
 """ESATAN-TMS decks -> a specification.
 
-Read are ``$LOCALS`` and ``$CONSTANTS`` (numbers and arithmetic over them), ``$NODES`` (D, B and X nodes), ``$CONDUCTORS``
-(GL, GR, GF, with loops) and, of ``$INITIAL`` and ``$VARIABLES1``, assignments of heats and locals under plain conditions.
+Read are ``$LOCALS`` and ``$CONSTANTS`` (numbers and arithmetic over them), ``$ARRAYS`` (numbers, and pairs over time), ``$NODES``
+(D, B and X nodes), ``$CONDUCTORS`` (GL, GR, GF, with loops) and, of ``$INITIAL`` and ``$VARIABLES1``, assignments of heats and
+locals under plain conditions, interpolation over time included.
 """
 
 import re
@@ -10,8 +11,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from twin_core._typing import FloatArray
 from twin_core.errors import SpecError
-from twin_core.interchange.imported import Imported, name_of, twin_id
+from twin_core.interchange.imported import Course, Imported, name_of, twin_id
 from twin_core.interchange.network import Deck, kelvin, specified
 from twin_core.network.formula import channels_of, evaluate
 
@@ -20,6 +22,11 @@ _NODE = re.compile(r"^([DBX])\s*(\d+)\s*=\s*'([^']*)'\s*(?:,(.*))?$", re.IGNOREC
 _CONDUCTOR = re.compile(r"^(G[A-Z])\s*\(\s*([^,()]+?)\s*,\s*([^,()]+?)\s*\)\s*=\s*(.+)$", re.IGNORECASE | re.DOTALL)
 _ASSIGNMENT = re.compile(r"^([A-Za-z]\w*?)\s*(?::?\s*(\d+))?\s*=\s*(.+)$", re.DOTALL)
 _LOOP = re.compile(r"^FOR\s+(\w+)\s*=\s*(.+?)\s+TO\s+(.+?)\s+DO$", re.IGNORECASE)
+_ARRAY = re.compile(r"^(\w+)\s*\(\s*(\d+)\s*(?:,\s*(\d+)\s*)?\)\s*=\s*(.+)$", re.DOTALL)
+_INTERPOLATION = re.compile(
+    r"\b(INTRP1|INTCYC)\s*\(\s*TIMEM\s*,\s*(\w+)\s*,\s*1\s*(?:,\s*([^,()]+?)\s*,\s*([^,()]+?)\s*)?\)", re.IGNORECASE
+)
+"""Linear interpolation of an array of pairs over the time of the mean step, once or in cycles."""
 _HEATS = ("QI", "QS", "QE", "QA", "QR")
 _SURFACES = ("A", "ALP", "EPS")
 _PLACES = ("FX", "FY", "FZ")
@@ -50,6 +57,8 @@ class _Reader:
     values: dict[str, float] = field(default_factory=dict)
     inactive: set[str] = field(default_factory=set)
     inactive_couplings: int = 0
+    arrays: dict[str, FloatArray] = field(default_factory=dict)
+    driven: dict[tuple[str, str], tuple[str, float]] = field(default_factory=dict)
     views: dict[tuple[str, str], float] = field(default_factory=dict)
     views_line: int = 0
     uses_views: bool = False
@@ -62,6 +71,7 @@ class _Reader:
         found = re.sub(r"(?<=[\d.])[dD](?=[-+]?\d)", "e", " ".join(text.split()))
         for relation, sign in _RELATIONS.items():
             found = re.sub(re.escape(relation), sign, found, flags=re.IGNORECASE)
+        found = re.sub(r"\b([A-Za-z]\w*)\s*\(\s*(\d+)\s*\)", self._element, found)
         found = re.sub(r"\b([A-Za-z]+)\s*:\s*(\d+)", r"\1_of_\2", found)
         found = re.sub(r"[A-Za-z_]\w*", lambda m: m[0] if re.match(r"^[eE]\d*$", m[0]) else m[0].lower(), found)
         try:
@@ -74,6 +84,51 @@ class _Reader:
         if not np.isfinite(value):
             raise _UnknownError(f"'{text.strip()[:60]}' is not finite")
         return value
+
+    def _element(self, match: re.Match[str]) -> str:
+        """Return an element of an array as a number; what is no array stays as it is."""
+        array = self.arrays.get(match[1].lower())
+        if array is None or array.ndim != 1:
+            return match[0]
+        if not 1 <= int(match[2]) <= array.size:
+            raise _UnknownError(f"'{match[0]}' is beyond the {array.size} elements of the array")
+        return repr(float(array[int(match[2]) - 1]))
+
+    def declare_array(self, statement: str) -> None:
+        """Read ``NAME(n) = ...`` or ``NAME(2, n) = x, y, x, y, ...``; the first index runs first."""
+        match = _ARRAY.match(statement)
+        if match is None:
+            raise _UnknownError(f"'{statement[:60]}' is no array of one or two dimensions")
+        values = np.array([self.number(part) for part in _parts(match[4])])
+        shape = [int(size) for size in (match[2], match[3]) if size is not None]
+        if values.size != int(np.prod(shape)):
+            raise _UnknownError(f"array {match[1]} has {values.size} values for {' x '.join(map(str, shape))}")
+        self.arrays[match[1].lower()] = values if len(shape) == 1 else values.reshape(shape[::-1]).T
+
+    def over_time(self, text: str) -> tuple[str, Course, float] | None:
+        """Return channel, course and factor of a heat that an array tells over time; None where it does not."""
+        match = _INTERPOLATION.search(text)
+        if match is None:
+            return None
+        name = match[2].lower()
+        array = self.arrays.get(name)
+        if array is None or array.ndim != 2 or array.shape[0] != 2 or array.shape[1] < 2:
+            raise _UnknownError(f"'{match[0][:60]}': {match[2]} is no array of pairs (2, n)")
+        if (np.diff(array[0]) <= 0.0).any():
+            raise _UnknownError(f"'{match[0][:60]}': the times of {match[2]} do not increase")
+        factor = self.number(text.replace(match[0], "1.0"))
+        rest = self.number(text.replace(match[0], "0.0"))
+        double = self.number(text.replace(match[0], "2.0"))
+        if rest != 0.0 or abs(double - 2.0 * factor) > 1e-12 * abs(factor) or factor <= 0.0:
+            raise _UnknownError(f"'{text[:60]}' is no positive multiple of what the array tells")
+        period = None
+        if match[1].upper() == "INTCYC":
+            if match[3] is None:
+                raise _UnknownError(f"'{match[0][:60]}' names no period")
+            period = self.number(match[3])
+            if self.number(match[4] or "0") != 0.0:
+                raise _UnknownError(f"'{match[0][:60]}': a cycle that begins elsewhere than at 0 is not read")
+        return match[2], Course(array[0], array[1], period), factor
 
     def node(self, text: str) -> str | None:
         """Return the name of a node by its number, which may be an expression; None where it is inactive."""
@@ -155,6 +210,14 @@ class _Reader:
         if key not in _HEATS:
             raise _UnknownError(f"'{statement[:60]}' changes what is not a heat")
         name = self.node(number)
+        if (told := self.over_time(text)) is not None:
+            channel, course, factor = told
+            self.deck.heats_W.get(key, {}).pop(name or "", None)
+            if name is not None:
+                self.deck.courses[channel] = course
+                self.driven[key, name] = channel, factor
+            return
+        self.driven.pop((key, name or ""), None)
         value = self.number(text)
         self.values[f"{key.lower()}_of_{int(number)}"] = value
         if name is not None:
@@ -186,7 +249,7 @@ def read_esatan(text: str, source: str, *, channels: Mapping[str, str] | None = 
     reader = _Reader(source, Deck(twin_id(model[1])))
     silent: set[str] = set()
     sections = list(_sections(text))
-    order = ("LOCALS", "CONSTANTS", "NODES", "CONDUCTORS")
+    order = ("LOCALS", "CONSTANTS", "ARRAYS", "NODES", "CONDUCTORS")
     for title, first, lines in sorted(sections, key=lambda s: order.index(s[0]) if s[0] in order else len(order)):
         if title in _SILENT:
             if any(line.strip() for line in lines):
@@ -196,6 +259,7 @@ def read_esatan(text: str, source: str, *, channels: Mapping[str, str] | None = 
             handle = {
                 "LOCALS": reader.define,
                 "CONSTANTS": reader.define,
+                "ARRAYS": reader.declare_array,
                 "NODES": reader.declare_node,
                 "CONDUCTORS": reader.declare_conductor,
             }[title]
@@ -211,6 +275,9 @@ def read_esatan(text: str, source: str, *, channels: Mapping[str, str] | None = 
                 if text_line.strip():
                     reader.refuse(n, f"'{text_line.strip()[:60]}' in ${title} is not read")
     deck = reader.deck
+    for (_, name), (channel, factor) in reader.driven.items():
+        own = deck.driven.setdefault(channel, {})
+        own[name] = own.get(name, 0.0) + factor
     if reader.views and reader.uses_views:
         _exchange(reader)
     elif reader.views:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from twin_core._typing import Json
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.errors import SpecError
-from twin_core.interchange.imported import Imported, number
+from twin_core.interchange.imported import Course, Imported, number
 
 SMALLEST = 1e-12
 """A coupling that is smaller carries nothing; the specification knows none."""
@@ -35,6 +35,10 @@ class Deck:
         (from, to) -> W/K.
     heats_W
         Cause -> node -> W; what is negative cools.
+    driven
+        Channel -> node -> factor by which the channel's heat goes into it.
+    courses
+        Channel -> how it goes over time, in W.
     labels
         Node -> what the deck calls it.
     notes, refused
@@ -49,6 +53,8 @@ class Deck:
     radiative: dict[tuple[str, str], float] = field(default_factory=dict)
     one_way: dict[tuple[str, str], float] = field(default_factory=dict)
     heats_W: dict[str, dict[str, float]] = field(default_factory=dict)
+    driven: dict[str, dict[str, float]] = field(default_factory=dict)
+    courses: dict[str, Course] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
@@ -110,7 +116,20 @@ def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: st
     document: Json = {"twin": deck.name}
     document["boundaries"] = {name: {"value_K": number(value)} for name, value in deck.boundaries.items()}
     document["channels"] = {column: {"kind": "temperature", "unit": "degC"} for column in read.values()}
+    driven = {name: nodes for name, nodes in deck.driven.items() if nodes}
+    document["channels"] |= {name: {"kind": "power", "unit": "W", "interpolation": "linear"} for name in driven}
+    if driven:
+        notes.append(
+            f"{source}: {len(driven)} heat(s) go over time and became channels that telemetry must carry "
+            f"({next(iter(driven))}, ...)"
+        )
     derived, loads = _loads(deck)
+    loads += [
+        {"channel": name, "node": node, "gain": {"value": number(gain)}}
+        for name, nodes in driven.items()
+        for node, gain in nodes.items()
+        if node in deck.capacities
+    ]
     document["derived"] = derived
     document["nodes"] = [
         {"id": node, "capacity_J_per_K": {"value": number(capacity)}} | ({"sensor": read[node]} if node in read else {})
@@ -122,7 +141,9 @@ def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: st
     ]
     document["radiation"] = couplings(deck.radiative, "area_m2")
     document["loads"] = loads
-    return Imported({k: v for k, v in document.items() if v}, tuple(notes), tuple(deck.refused), dict(deck.start_K))
+    whole = {k: v for k, v in document.items() if v}
+    courses = {name: deck.courses[name] for name in driven}
+    return Imported(whole, tuple(notes), tuple(deck.refused), dict(deck.start_K), courses)
 
 
 def _loads(deck: Deck) -> tuple[Json, list[Json]]:

@@ -7,20 +7,25 @@ refused by line.
 import re
 from collections.abc import Callable, Mapping
 
+import numpy as np
+
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4, ZERO_CELSIUS_K
-from twin_core.interchange.imported import Imported, twin_id
+from twin_core.interchange.imported import Course, Imported, twin_id
 from twin_core.interchange.network import Deck, specified
 
 _HEADER = re.compile(r"^\s*HEADER\s+([A-Z0-9 ]+?)\s*(?:,\s*(\w+))?\s*$", re.IGNORECASE)
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 _HEAT = re.compile(rf"^\s*(?:(\w+)\.)?Q(\d+)\s*=\s*(?:(?:\1\.)?Q\2\s*\+\s*)?({_NUMBER})\s*$", re.IGNORECASE)
-_RATES = re.compile(rf"{_NUMBER}")
+
+_RATED = re.compile(r"^C\s+solar albedo planetshine - (\S+)\s")
 
 _SILENT = ("OPTIONS", "OPERATION DATA", "OUTPUT CALLS", "SOLVER")
 """Blocks that say how to solve and print, not what the model is."""
 
 
-def read_sinda(texts: Mapping[str, str], *, channels: Mapping[str, str] | None = None, held: bool = False) -> Imported:
+def read_sinda(
+    texts: Mapping[str, str], *, channels: Mapping[str, str] | None = None, held: bool = False, over_time: bool = False
+) -> Imported:
     """Return a deck as a specification.
 
     Parameters
@@ -32,8 +37,10 @@ def read_sinda(texts: Mapping[str, str], *, channels: Mapping[str, str] | None =
         ``SUBMODEL.node`` -> column of the telemetry that reads it.
     held
         Take couplings as known; by default they are guesses.
+    over_time
+        Read the course of the heat rates over the orbit, a channel per node, instead of their averages.
     """
-    reader = _Reader(Deck(twin_id(next(iter(texts)).rsplit("/", 1)[-1].split(".")[0])))
+    reader = _Reader(over_time, Deck(twin_id(next(iter(texts)).rsplit("/", 1)[-1].split(".")[0])))
     for source in sorted(texts, key=lambda name: not name.endswith(".inp")):  # its constants come first
         reader.read(source, texts[source])
     deck = reader.deck
@@ -45,24 +52,29 @@ def read_sinda(texts: Mapping[str, str], *, channels: Mapping[str, str] | None =
 class _Reader:
     """One deck, file after file."""
 
-    def __init__(self, deck: Deck) -> None:
-        self.deck = deck
+    def __init__(self, over_time: bool, deck: Deck) -> None:
+        self.deck, self.over_time = deck, over_time
         self.sigma = STEFAN_BOLTZMANN_W_PER_M2_K4
         self.zero = 0.0
         self.unseen: dict[str, str] = {}
         self.waiting: list[tuple[str, str, str, bool, float]] = []
         self.rates: list[float] = []
         self.rated: list[str] = []
+        self.times: list[float] = []
+        self.courses: dict[str, list[float]] = {}
+        self.announced: list[float] | None = None
+        self.filling: list[float] | None = None
 
     def read(self, source: str, text: str) -> None:
         """Read one file."""
         block, submodel = "", "MAIN"
-        self.rates, self.rated, averages = [], [], False
+        self.rates, self.rated, self.times, self.courses = [], [], [], {}
+        self.announced = self.filling = None
         self.waiting = []
         for n, raw in enumerate(text.splitlines(), start=1):
             where = f"{source}: line {n}"
             if raw[:1] in ("C", "c") and (len(raw) == 1 or not raw[1].isalpha()):
-                averages = self._comment(raw, averages)
+                self._comment(raw)
                 continue
             line = raw.split("$", 1)[0].rstrip()
             if not line.strip():
@@ -100,15 +112,21 @@ class _Reader:
             return True
         return line.strip().upper().startswith(("PSTOP", "PSTART"))
 
-    def _comment(self, raw: str, averages: bool) -> bool:
-        """Return whether the heat rates of an orbit, which stand in comments, go on."""
+    def _comment(self, raw: str) -> None:
+        """Read the heat rates of an orbit, which stand in comments: a title announces an array, a number opens it."""
         if "Average heating rates" in raw:
-            return True
-        found = _RATES.findall(raw[1:].split("=", 1)[-1]) if averages else []
-        if averages and not re.match(rf"^C\s+(\d+\s*=)?\s*({_NUMBER}\s*,?\s*)+$", raw):
-            return False
-        self.rates += [float(x) for x in found]
-        return averages
+            self.announced = self.rates
+        elif re.match(r"^C\s+Time Array", raw):
+            self.announced = self.times
+        elif match := _RATED.match(raw):
+            self.announced = self.courses.setdefault(match[1].upper(), [])
+        elif (values := _values(raw)) is not None:
+            if "=" in raw:
+                self.filling, self.announced = self.announced, None
+            if self.filling is not None:
+                self.filling += values
+            return
+        self.filling = None
 
     def _node(self, where: str, submodel: str, line: str) -> bool:
         parts = [p.strip() for p in line.split(",")]
@@ -203,11 +221,28 @@ class _Reader:
         for node, rate in zip(nodes, self.rates, strict=True):
             if not self.deck.knows(node):
                 self.unseen.setdefault(node, source)
-            self.deck.heat("orbit_average", node, rate)
-        if nodes:
+            course = self.courses.get(node, [])
+            if self.over_time and len(course) == len(self.times) > 1:
+                self.deck.driven[f"Q_{node}"] = {node: 1.0}
+                self.deck.courses[f"Q_{node}"] = Course(np.array(self.times), np.array(course), self.times[-1])
+            else:
+                self.deck.heat("orbit_average", node, rate)
+        averaged = sum(f"Q_{node}" not in self.deck.courses for node in nodes)
+        if averaged and not self.over_time:
             self.deck.notes.append(
-                f"{source}: {len(nodes)} heat rates are averages over the orbit; their course in time is not read"
+                f"{source}: {averaged} heat rates are averages over the orbit; --over-time reads their course"
             )
+        elif averaged:
+            self.deck.notes.append(f"{source}: {averaged} heat rates have no course over the orbit and are averages")
+
+
+def _values(raw: str) -> list[float] | None:
+    """Return the numbers of a comment that holds nothing else but the number of an array before them; None of any other."""
+    number, equals, rest = raw[1:].partition("=")
+    if equals and not number.strip().isdigit():
+        return None
+    tokens = (rest if equals else number).replace(",", " ").split()
+    return [_float(t) for t in tokens] if tokens and all(map(_is_number, tokens)) else None
 
 
 def _is_number(text: str) -> bool:

@@ -11,7 +11,7 @@ from scipy.optimize import fsolve
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
 from twin_core.errors import NoSolutionError, SpecError
 from twin_core.interchange.esatan import read_esatan
-from twin_core.interchange.imported import Imported
+from twin_core.interchange.imported import Course, Imported, over_time
 from twin_core.interchange.sinda import read_sinda
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
@@ -98,7 +98,7 @@ WRONG = {
     "GR(12, 99) = 0.01;": ("GR(12, 99) = INTRP1(T12, tab, 1);", "cannot use 'intrp1"),
     "QI11 = QI10 / 2": ("CALL HEATER(11)", "not understood"),
     "D10 = 'Pin', T = 0.0, C = 5.0;": ("D10 = 'Pin', T = 0.0, C = unheard;", "'unheard' is not known"),
-    "  $ARRAYS\n": ("  $ARRAYS\n    tab = 1, 2;\n", "in $ARRAYS is not read"),
+    "  $ARRAYS\n": ("  $ARRAYS\n    tab = 1, 2;\n", "is no array of one or two dimensions"),
 }
 
 
@@ -232,3 +232,102 @@ def test_the_deck_of_a_small_satellite_is_read_whole() -> None:
         if "n99999" in r["between"]
     )
     assert lost_W == pytest.approx(sum(heats.values()), rel=1e-6)
+
+
+def timed(assignments: str) -> Imported:
+    """Return the plate with arrays, and heats that follow them."""
+    arrays = """\
+  $ARRAYS
+    $REAL
+      SUN(2, 4) = 0.0, 0.0,  1000.0, 80.0,  2000.0, 80.0,  6000.0, 0.0;
+      CARDS(3) = 1.5, 2.5, k * 2.0;
+"""
+    code = f"  $VARIABLES1\n{assignments}  $EXECUTION\n"
+    return read_esatan(ESATAN.replace("  $ARRAYS\n", arrays).replace("  $EXECUTION\n", code), "plate.d", held=True)
+
+
+def test_esatan_arrays_are_read_as_numbers_and_over_time() -> None:
+    imported = timed(
+        "      QS1 = 0.3 * INTCYC(TIMEM, SUN, 1, 6000.0, 0.0) * width\n"
+        "      QA1 = INTRP1(TIMEM, SUN, 1)\n"
+        "      QI12 = CARDS(2) + CARDS(3)\n"
+    )
+    assert not imported.refused, imported.refused
+    assert imported.data["channels"]["SUN"] == {"kind": "power", "unit": "W", "interpolation": "linear"}
+    gains = {load["node"]: load["gain"]["value"] for load in imported.data["loads"] if load["channel"] == "SUN"}
+    assert gains == {"n1": pytest.approx(0.3 * 0.1 + 1.0)}
+    heats = {load["node"]: load["gain"]["value"] for load in imported.data["loads"] if load["channel"] == "QI"}
+    assert heats["n12"] == pytest.approx(2.5 + 4.0)
+    time_s, columns = over_time(imported.courses, 9000.0)
+    np.testing.assert_allclose(np.interp([500.0, 4000.0], time_s, columns["SUN"]), [40.0, 40.0])
+    load_spec(imported.data)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "said"),
+    [
+        ("QS1 = INTCYC(TIMEM, MOON, 1, 6000.0, 0.0)", "MOON is no array of pairs"),
+        ("QS1 = INTCYC(TIMEM, SUN, 1)", "names no period"),
+        ("QS1 = 1.0 + INTRP1(TIMEM, SUN, 1)", "is no positive multiple"),
+        ("QI1 = CARDS(7)", "beyond the 3 elements"),
+    ],
+)
+def test_what_an_array_cannot_say(assignment: str, said: str) -> None:
+    assert any(said in line for line in timed(f"      {assignment}\n").refused)
+
+
+def test_a_cycle_repeats_and_a_course_ends_where_it_ends() -> None:
+    cycle = Course(np.array([0.0, 50.0, 100.0]), np.array([1.0, 3.0, 1.0]), 100.0)
+    once = Course(np.array([0.0, 30.0]), np.array([5.0, 8.0]))
+    time_s, columns = over_time({"a": cycle, "b": once}, 250.0)
+    np.testing.assert_array_equal(time_s, [0.0, 30.0, 50.0, 100.0, 150.0, 200.0, 250.0])
+    np.testing.assert_allclose(columns["a"], [1.0, 2.2, 3.0, 1.0, 3.0, 1.0, 3.0])
+    np.testing.assert_allclose(columns["b"], [5.0, 8.0, 8.0, 8.0, 8.0, 8.0, 8.0])
+
+
+COURSES = """\
+C Time Array
+C     5=           0.0,1.000000e+03 ,2.000000e+03
+      5=           0.0,1.000000e+03 ,2.000000e+03
+C solar albedo planetshine - BOX.1 Area = 0.000723 Avg = 0.002449 0.000580 0.012304
+C Errors:  20.1, 20.1
+C          20.1
+C     6= 1.000000e-01 ,2.000000e-01
+C       1.000000e-01
+C solar albedo planetshine - BOX.3 Area = 0.000723 Avg = 0.002449 0.000580 0.012304
+C Errors:  20.1, 20.1, 20.1
+C     7= 3.000000e-01 ,2.000000e-01 ,3.000000e-01
+HEADER CARRAY DATA, RATES
+"""
+
+
+def test_heat_rates_of_an_orbit_over_time() -> None:
+    deck = {name: text.replace("-BOX.3", "BOX.-3") for name, text in SINDA.items()}
+    deck["case.hra"] = deck["case.hra"].replace("HEADER CARRAY DATA, RATES\n", COURSES)
+    averaged = read_sinda(deck, channels={"BOX.1": "T"}, held=True)
+    assert not averaged.courses and any("--over-time" in note for note in averaged.notes)
+    imported = read_sinda(deck, channels={"BOX.1": "T"}, held=True, over_time=True)
+    assert not imported.refused, imported.refused
+    assert set(imported.courses) == {"Q_BOX.1", "Q_BOX.3"}
+    course = imported.courses["Q_BOX.1"]
+    np.testing.assert_allclose(course.at(np.array([500.0, 1000.0, 2500.0])), [0.15, 0.2, 0.15])
+    loads = {load["channel"]: load["node"] for load in imported.data["loads"]}
+    assert loads["Q_BOX.1"] == "BOX.1" and "orbit_average" not in loads
+    load_spec(imported.data)
+
+
+@pytest.mark.skipif(not (MODELS / "sinda").is_dir(), reason="other people's decks are not beside this checkout")
+def test_the_heat_rates_of_a_flown_cubesat_average_to_its_averages() -> None:
+    folder = MODELS / "sinda" / "oresat05"
+    names = ("case0.inp", "case0.cc", "C0A0.k", "C0A2.k", "C0A1.hra")
+    texts = {name: (folder / name).read_text() for name in names}
+    imported = read_sinda(texts, channels={"BATTERY.1": "T"}, held=True, over_time=True)
+    assert not imported.refused and len(imported.courses) > 300
+    averages = {
+        load["node"]: load["gain"]["value"]
+        for load in read_sinda(texts, channels={"BATTERY.1": "T"}, held=True).data["loads"]
+        if load["channel"] == "orbit_average"
+    }
+    for name, course in imported.courses.items():
+        mean = float(np.trapezoid(course.values, course.time_s) / course.time_s[-1])
+        assert mean == pytest.approx(averages[name.removeprefix("Q_")], rel=1e-3), name
