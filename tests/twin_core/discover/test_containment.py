@@ -12,11 +12,11 @@ from numpy.linalg import LinAlgError
 
 from benchmarks.network_cases import network_case
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects
-from twin_core.discover.phrasing import headline
 from twin_core.discover.search import search
 from twin_core.errors import TelemetryError
+from twin_core.report.phrasing import headline
 
 SOLVERS = (
     *(f"numpy.linalg.{name}" for name in ("solve", "svd", "pinv", "eigh")),

@@ -13,8 +13,6 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, is_late, limited
 from twin_core.calibrate.undeclared.model import HeatFit, Nominal, floor_K2
-from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
-from twin_core.discover.followed import followed
 from twin_core.discover.judge import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
@@ -25,6 +23,8 @@ from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_extended
+from twin_core.missing_heat.drivers import followed
+from twin_core.missing_heat.effect_heat import effect_heat, nodes_of_interest
 from twin_core.network.dynamics import fill_boundaries, reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
