@@ -24,6 +24,7 @@ $(BENCH): $(STAMP)
 $(GROUND): $(STAMP)
 	$(BIN)/pip install --quiet --editable ".[dev,neural,ground]"
 	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/openmct openmct@4
+	! command -v npm >/dev/null || npm install --silent --prefix $(VENV)/grafana @grafana/schema typescript
 	touch $@
 
 $(DOCS): $(STAMP)

@@ -20,7 +20,7 @@ from service.http.body_limit import Bodies
 from service.http.deps import Service, known_parameters
 from service.http.head import Heads
 from service.http.observe import Observe
-from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, streams, telemetry, twins
+from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, rows, streams, telemetry, twins
 from service.http.shortcut import Shortcut
 from service.intake import Intake
 from service.jobs.executor import ProcessPerTask, Tasks
@@ -48,6 +48,7 @@ ROUTERS = (
     models.router,
     live.router,
     alarms.router,
+    rows.router,
     streams.router,
     admin.audit,
     admin.webhooks,

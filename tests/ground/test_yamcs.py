@@ -110,7 +110,7 @@ def running(bridge: Any) -> Iterator[Any]:
 
 def until(condition: Callable[[], Any], what: str) -> None:
     """Wait until something is so."""
-    for _ in range(900):
+    for _ in range(3000):
         if condition():
             return
         time.sleep(0.1)

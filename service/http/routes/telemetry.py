@@ -110,7 +110,7 @@ async def archive(
     max_points: Points = None,
 ) -> Response:
     """Return start <= time < stop as columns; beyond ``max_points`` only samples that hold extremes."""
-    names = _named(channels, twin)
+    names = named(channels, twin)
     max_points = bounded(max_points, len(names))
     start_us, stop_us = span(start, stop)
     rows = [twin.channels.index(name) for name in names]
@@ -131,7 +131,7 @@ async def export_file(
     channels: Annotated[str | None, Query(description="Channels separated by commas; absent: all.")] = None,
 ) -> StreamingResponse:
     """Return every sample of start <= time < stop as a file, however long it gets."""
-    pieces = export.stream(service.database, twin, _named(channels, twin), *span(start, stop), format)
+    pieces = export.stream(service.database, twin, named(channels, twin), *span(start, stop), format)
     headers = {"Content-Disposition": f'attachment; filename="{twin.name}.{format}"'}
     return StreamingResponse(pieces, media_type=export.MEDIA[format], headers=headers)
 
@@ -147,7 +147,7 @@ async def delete(
     """Delete start <= time < stop, or the values of some channels there; it can be undone for a day."""
     if start is None and stop is None and channels is None:
         raise Problem(422, "name at least one of start, stop and channels; to delete everything, delete the twin")
-    names = None if channels is None else _named(channels, twin)
+    names = None if channels is None else named(channels, twin)
     made = await service.hub.write(twin.key, archive_changes.delete, twin, *span(start, stop), names)
     if made.samples:
         service.live.archive_changed(twin)
@@ -226,7 +226,7 @@ def span(start: str | None, stop: str | None) -> tuple[int | None, int | None]:
     return start_us, stop_us
 
 
-def _named(channels: str | None, twin: Entry) -> list[str]:
+def named(channels: str | None, twin: Entry) -> list[str]:
     if channels is None:
         return list(twin.channels)
     names = list(dict.fromkeys(name.strip() for name in channels.split(",")))
