@@ -16,7 +16,7 @@ COPY twin_core twin_core
 COPY thermal_twin thermal_twin
 COPY service service
 COPY replay replay
-RUN pip install ".[neural]" && python -m compileall -q /opt/twin
+RUN pip install ".[neural,postgres,dask]" && python -m compileall -q /opt/twin
 
 FROM python:3.11-slim
 RUN useradd --system --uid 10001 --home-dir /data --shell /usr/sbin/nologin twin \

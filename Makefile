@@ -8,7 +8,7 @@ GROUND := $(VENV)/.ground
 DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service serve clean
+.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -89,6 +89,10 @@ bench-service: $(STAMP)
 	$(BIN)/python -m benchmarks.soak --minutes $(SOAK_MINUTES)
 	$(BIN)/python -m benchmarks.anomaly_events
 	$(BIN)/python -m benchmarks.forecast_coverage
+
+bench-fleet: $(STAMP)
+	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.family
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b

@@ -22,7 +22,10 @@ _user = click.option("--user", help="User of Yamcs; the password is read from YA
 _json = click.option("--json", "as_json", is_flag=True, help="Print the outcome as JSON.")
 
 
-@click.group(short_help="Bring a twin into Yamcs and other products of a control room.")
+@click.group(
+    short_help="Bring a twin into Yamcs and other products of a control room.",
+    epilog="\b\nExample:\n  twin bridge yamcs --url http://127.0.0.1:8090 --instance sat --config bridge.yaml",
+)
 def bridge() -> None:
     """Keep a twin and a control system in step."""
 

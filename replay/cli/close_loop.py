@@ -25,14 +25,17 @@ VERDICTS = {
     short_help="Find and add what the model lacks.",
     example="twin close-loop --spec sat.yaml --telemetry flight.csv --holdout 0.3 --out loop",
 )
-@click.option("--spec", "spec_file", required=True, type=FILE, help="Specification, YAML or JSON.")
+@click.option("--spec", "spec_file", type=FILE, help="Specification, YAML or JSON.")
 @click.option(
     "--telemetry",
-    required=True,
     multiple=True,
     metavar="FILE...",
     type=FILE,
     help="CSV or MCAP files, one per segment.",
+)
+@click.option("--fleet", type=FILE, metavar="DIR", help="Many at once: a folder each, with spec.yaml and telemetry.")
+@click.option(
+    "--executor", default="process", show_default=True, help="What computes a fleet: process, or dask://HOST:PORT."
 )
 @click.option("--holdout", type=float, help="Share of the time span kept back at the end.  [default: 0.3]")
 @click.option(
@@ -50,8 +53,10 @@ VERDICTS = {
 @effects_option
 @click.option("--json", "as_json", is_flag=True, help="Print the report as JSON.")
 def close_loop(
-    spec_file: Path,
+    spec_file: Path | None,
     telemetry: tuple[Path, ...],
+    fleet: Path | None,
+    executor: str,
     holdout: float | None,
     holdout_telemetry: tuple[Path, ...],
     burn_in: float | None,
@@ -68,6 +73,7 @@ def close_loop(
     Exits with 0 whenever it reaches a verdict, also when the verdict is that no effect is supported.
     """
     from replay.cli.console import notify, print_line, progress_bar, to_json
+    from replay.cli.fleet import close_fleet
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import check_apart, load_records
     from replay.cli.signed import document
@@ -75,6 +81,19 @@ def close_loop(
     from twin_core.network.spec_io import load_spec
 
     _check(holdout, holdout_telemetry, burn_in, false_alarm_rate, out)
+    if fleet is not None:
+        if spec_file is not None or telemetry or holdout_telemetry:
+            raise click.UsageError(
+                "--fleet excludes --spec, --telemetry and --holdout-telemetry; each folder holds its own"
+            )
+        if executor != "process" and not executor.startswith("dask://"):
+            raise click.UsageError(f"--executor must be process or dask://HOST:PORT (got {executor})")
+        options = {"holdout": 0.3 if holdout is None else holdout, "false_alarm_rate": false_alarm_rate}
+        options |= {} if deadline is None else {"deadline_s": deadline}
+        _print_fleet(close_fleet(fleet, executor, out, options, masking=not no_masking), out, as_json)
+        return
+    if spec_file is None or not telemetry:
+        raise click.UsageError("give --spec and --telemetry, or --fleet")
     spec = load_spec(spec_file)
     records = load_records(telemetry, spec, masking=not no_masking)
     held_out = load_records(holdout_telemetry, spec, masking=not no_masking)
@@ -134,6 +153,24 @@ def _save(loop: "ClosedLoop", out: Path) -> None:
     write_text(out / "model.json", to_json(loop.model.to_json()))
     write_text(out / "report.json", to_json(loop.report))
     write_text(out / "report.html", render(loop.report, loop.plots))
+
+
+def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -> None:
+    """Print a line per spacecraft."""
+    from replay.cli.console import print_line, print_table, short, to_json
+
+    if as_json:
+        print_line(to_json(reports).rstrip())
+        return
+    rows = []
+    for name, report in sorted(reports.items()):
+        if "error" in report:
+            rows.append([name, report["error"][:80], "", ""])
+        else:
+            found = ", ".join(describe(finding) for finding in report["findings"]) or report["verdict"]
+            rows.append([name, found, short(report["before"]["rmse_K"]), short(report["after"]["rmse_K"])])
+    print_table("fleet", ["spacecraft", "found", "before K", "after K"], rows)
+    print_line(f"wrote {out}/fleet.json, and report.html, report.json, model.json of each")
 
 
 def print_report(report: dict[str, Any]) -> None:

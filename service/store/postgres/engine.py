@@ -56,12 +56,11 @@ def _translated(query: str) -> str:
     return query.replace("%", "%%").replace("?", "%s")
 
 
-def connect(url: str, *, read_only: bool = False, autocommit: bool = True) -> "psycopg.Connection[Any]":
+def connect(url: str) -> "psycopg.Connection[Any]":
     """Return a connection of the driver; Unavailable if the server cannot be reached, without what is secret of the URL."""
     try:
         own = psycopg.conninfo.conninfo_to_dict(url).get("options", "")
-        options = f"{OPTIONS}{' -c default_transaction_read_only=on' if read_only else ''} {own}"
-        return psycopg.connect(url, autocommit=autocommit, options=options, **SETTINGS)  # type: ignore[arg-type]
+        return psycopg.connect(url, autocommit=True, options=f"{OPTIONS} {own}", **SETTINGS)  # type: ignore[arg-type]
     except (psycopg.OperationalError, psycopg.ProgrammingError) as error:
         raise Unavailable(f"the database cannot be reached: {_without_secrets(error, url)}") from None
 
@@ -171,7 +170,7 @@ class PostgresEngine:
     def _read(self, operation: Callable[[Connection], T]) -> T:
         speaking: Speaking | None = getattr(self._local, "connection", None)
         if speaking is None or speaking.driver.closed or speaking.driver.broken:
-            speaking = self._local.connection = Speaking(connect(self.url, read_only=True))
+            speaking = self._local.connection = Speaking(connect(self.url))
             self._opened.append(speaking.driver)
         speaking.execute("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY")
         try:

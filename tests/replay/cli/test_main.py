@@ -19,10 +19,12 @@ def test_the_commands() -> None:
         *(
             "backup",
             "balance",
+            "bridge",
             "calibrate",
             "check",
             "check-effect",
             "close-loop",
+            "convert",
             "correlate",
             "demo",
             "export",
