@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from replay.errors import RecordingError
-from replay.mcap_writer import VALUE, McapWriter
+from replay.mcap_writer import LOG, VALUE, McapWriter
 from replay.recording import Recording, align
 
 Samples = dict[str, tuple[list[int], list[float]]]
@@ -119,7 +119,9 @@ def _read(source: Path, stream: IO[bytes], cut: bool) -> list[Recording]:
     reader = make_reader(stream)
     samples: Samples = {}
     units: dict[str, str] = {}
-    for _, channel, message in reader.iter_messages(log_time_order=False):
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        if schema is not None and schema.name == LOG:
+            continue  # events, which are no telemetry
         if channel.message_encoding != "json":
             raise RecordingError(
                 f"{source}: topic '{channel.topic}' is encoded as {channel.message_encoding}, not json"

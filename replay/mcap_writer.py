@@ -16,6 +16,25 @@ from replay.errors import RecordingError
 METADATA_NAME = "thermal-twin"
 SCHEMA_NAME = "thermal_twin.Sample"
 VALUE = "value"
+LOG, LOG_TOPIC = "foxglove.Log", "/events"
+INFO, WARNING, ERROR = 2, 3, 4
+"""Levels of a log message."""
+_LOG_SCHEMA = {
+    "$schema": "https://json-schema.org/draft/2020-12/schema",
+    "title": LOG,
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "title": "time",
+            "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0}},
+        },
+        "level": {"type": "integer", "minimum": 0},
+        **{name: {"type": "string"} for name in ("message", "name", "file")},
+        "line": {"type": "integer", "minimum": 0},
+    },
+}
+"""The Log message of Foxglove, which its log panel shows."""
 
 
 class McapWriter:
@@ -95,6 +114,21 @@ class McapWriter:
         except OSError as error:
             raise self._refusal(error) from error
         self.count += 1
+
+    def log(self, instant_ns: int, level: int, name: str, message: str) -> None:
+        """Write an event as a log message of Foxglove, under ``/events``; RecordingError as of ``add``."""
+        if instant_ns < 0:
+            raise RecordingError(f"{self._target}: an event has a time before 1970, which MCAP cannot express")
+        if LOG_TOPIC not in self._channels:
+            schema = self._writer.register_schema(LOG, "jsonschema", orjson.dumps(_LOG_SCHEMA))
+            self._channels[LOG_TOPIC] = int(self._writer.register_channel(LOG_TOPIC, "json", schema))
+        sec, nsec = divmod(instant_ns, 1_000_000_000)
+        body = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message, "name": name}
+        data = orjson.dumps({**body, "file": "", "line": 0})
+        try:
+            self._writer.add_message(self._channels[LOG_TOPIC], instant_ns, data, publish_time=instant_ns)
+        except OSError as error:
+            raise self._refusal(error) from error
 
     def _add_channel(self, topic: str) -> int:
         """Register one topic and its schema; return the channel's number."""

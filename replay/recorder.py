@@ -3,12 +3,12 @@
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from replay.errors import ReplayError
-from replay.mcap_writer import McapWriter
+from replay.mcap_writer import INFO, WARNING, McapWriter
 from service.client import ApiError, AsyncTwinClient, Unreachable
 from service.schemas import Archive, Message, Residuals, TwinDetail
 
@@ -62,6 +62,7 @@ class Recorder:
         self._client, self._twin, self._writer, self._progress = client, twin, writer, progress
         self.tally = Tally()
         self._last_ns = -1
+        self._said: set[tuple[int, str]] = set()
 
     async def take_archive(self, start: str | None) -> None:
         """Write what the archive holds from an instant on, or all of it; ReplayError if the service refuses."""
@@ -94,6 +95,8 @@ class Recorder:
             values = {RESIDUAL.format(name): value for name, value in body["residual_K"].items()}
             self._write(message.time, values, is_sample=False)
             self.tally.residuals += 1
+        elif message.type == "anomaly":
+            self._say(body["anomaly"])
         elif message.type == "dropped":
             self.tally.gaps += 1
             await self._fetch(self.tally.last_time)
@@ -112,6 +115,18 @@ class Recorder:
             self._progress(self.tally)
         if head.active_model is not None:
             await self._fetch_residuals(span)
+
+            for found in await self._client.anomalies(self._twin, start=_text(span[0]), stop=_text(span[1])):
+                self._say(found.model_dump())
+
+    def _say(self, anomaly: dict[str, Any]) -> None:
+        """Write that an anomaly began, or that it ended, once each, as a log message."""
+        for what, at in (("begins", anomaly["start"]), ("ends", anomaly["stop"])):
+            if at is not None and (anomaly["id"], what) not in self._said:
+                self._said.add((anomaly["id"], what))
+                cause = f" ({anomaly['cause']['effect']})" if anomaly["cause"] else ""
+                level = WARNING if what == "begins" else INFO
+                self._writer.log(1000 * _us(at), level, anomaly["sensor"], f"{what}: {anomaly['message']}{cause}")
 
     async def _fetch_residuals(self, span: tuple[int, int]) -> None:
         try:

@@ -348,6 +348,10 @@ class AsyncTwinClient:
         """Return innovations and NIS between ``start`` and ``stop``."""
         return await self.send(calls.residuals(name, parameters))
 
+    async def anomalies(self, name: str, **parameters: str | int | float | None) -> list[schemas.Anomaly]:
+        """Return anomalies between ``start`` and ``stop``."""
+        return (await self.send(calls.anomalies(name, parameters))).anomalies
+
     async def register(self, specification: Mapping[str, Any]) -> schemas.TwinDetail:
         """Register a specification."""
         return await self.send(calls.register(specification))

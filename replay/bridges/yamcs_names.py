@@ -23,8 +23,10 @@ def name_of(config: YamcsConfig, *parts: str) -> str:
 
 
 def sensors_of(twin: TwinDetail) -> list[str]:
-    """Return the temperature channels of a twin."""
-    return [name for name in twin.channels if twin.specification["channels"][name]["kind"] == "temperature"]
+    """Return the channels that are sensors of a node, which the twin predicts; a boundary's temperature is not among them."""
+    named = [node["sensor"] for node in twin.specification["nodes"] if node.get("sensor")]
+    sensors = {name for entry in named for name in ([entry] if isinstance(entry, str) else entry)}
+    return [name for name in twin.channels if name in sensors]
 
 
 def published_names(config: YamcsConfig, twin: TwinDetail) -> list[str]:

@@ -10,7 +10,8 @@ from replay.bridges.errors import BridgeError
 from replay.bridges.instants import parse_utc_ms, service_ms, to_datetime, to_ms, to_text
 from replay.bridges.units import conversion
 from replay.bridges.yamcs_events import SEVERITY, number_of, of_alarms, of_anomalies, of_diagnoses
-from service.schemas import Alarm, Anomaly, Job
+from replay.bridges.yamcs_names import sensors_of
+from service.schemas import Alarm, Anomaly, Job, TwinDetail
 
 LEAST = {"twin": "sat", "parameters": {"T_a": "/SAT/T_a"}}
 
@@ -123,3 +124,14 @@ def test_a_finding_is_told_with_place_numbers_and_a_link() -> None:
     assert finding.message == f"missing_conductor at nodes a - b: G_W_per_K = 2 ± 0.12; report: {link}"
     assert finding.link == link and finding.severity == "watch"
     assert nothing.message.startswith("no effect supported") and nothing.severity == "info"
+
+
+def test_only_sensors_of_nodes_are_published() -> None:
+    """A boundary whose temperature is a channel is no sensor: the twin is given it and predicts nothing of it."""
+    specification = {
+        "channels": {name: {"kind": "temperature", "unit": "K"} for name in ("T_a", "T_bus", "T_b", "T_c")},
+        "nodes": [{"id": "a", "sensor": "T_a"}, {"id": "b", "sensor": ["T_b", "T_c"]}, {"id": "hidden"}],
+        "boundaries": {"bus": {"channel": "T_bus"}},
+    }
+    twin = TwinDetail.model_construct(channels=list(specification["channels"]), specification=specification)
+    assert sensors_of(twin) == ["T_a", "T_b", "T_c"]

@@ -103,8 +103,7 @@ export class Objects {
         };
       case 'measured':
         return {
-          identifier, name: declared.kind === 'temperature' ? `${channel} measured` : channel, type: KIND.measured,
-          ...(declared.kind === 'temperature' ? below : { location: this.keyString('twin', twin) }),
+          identifier, name: `${channel} measured`, type: KIND.measured, ...below,
           telemetry: { values: [TIME, range('value', channel, unit, 1)] }
         };
       case 'forecast':
@@ -143,9 +142,10 @@ export class Objects {
     if (kind === 'sensor') {
       return DRAWN.map(([what]) => this.id(what, twin, channel));
     }
-    const channels = (await this.twin(twin)).specification.channels;
+    const { channels, nodes } = (await this.twin(twin)).specification;
     const names = Object.keys(channels);
-    const sensors = names.filter((name) => channels[name].kind === 'temperature');
+    const sensed = new Set(nodes.flatMap((node) => node.sensor ?? [])); // a boundary's temperature is given, not predicted
+    const sensors = names.filter((name) => sensed.has(name));
     return [
       this.id('anomalies', twin),
       ...sensors.flatMap((name) => [this.id('sensor', twin, name), this.id('residual', twin, name)]),
