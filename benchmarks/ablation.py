@@ -16,7 +16,8 @@ from typing import Any
 from benchmarks.case import read_case
 from benchmarks.loop import HOLDOUT, place
 from benchmarks.markdown import commit, markdown_table, save_table
-from twin_core.discover import close_loop, policy
+from twin_core.closed_loop import close_loop
+from twin_core.discover import policy
 
 AS_IT_IS = "as it is"
 VARIANTS = ("off", "half", "double")

@@ -20,8 +20,8 @@ from benchmarks.loop import known_effect_trial, run_all
 from benchmarks.loop_cases import Task
 from benchmarks.markdown import markdown_table, save_table
 from twin_core.calibrate.second_order import to_model
-from twin_core.discover.loop import centred
-from twin_core.discover.report import parameters_json
+from twin_core.closed_loop import centred
+from twin_core.report.build import parameters_json
 
 FIRST_SEED = 3000
 """Seeds from here on belong to the study; the suite uses smaller ones."""

@@ -27,7 +27,7 @@ from benchmarks.bands import Row
 from benchmarks.loop_cases import Task, suite
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_splits import DATA, SPLITS, Prepared
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import dump_spec, load_spec
 from twin_core.telemetry import Record

@@ -16,14 +16,14 @@ import pandas as pd
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_splits import DATA, ROOT
 from twin_core._typing import FloatArray
+from twin_core.closed_loop import close_loop
 from twin_core.constants import ZERO_CELSIUS_K
-from twin_core.discover import close_loop
-from twin_core.discover.phrasing import sentence
 from twin_core.interchange.xija import read_xija
 from twin_core.network.model import build_network
 from twin_core.network.screened import screened
 from twin_core.network.spec_io import load_spec
 from twin_core.orbit.sun import sun_direction
+from twin_core.report.phrasing import sentence
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.markdown import markdown_table, save_table
 from twin_core.calibrate import CalibratedModel, calibrate
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.fem.demo import ORBIT_S, demo_scenario
 from twin_core.fem.scenario import load_scenario
 from twin_core.fem.simulate import simulate

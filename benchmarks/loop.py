@@ -21,12 +21,12 @@ from benchmarks.case import Case
 from benchmarks.loop_cases import FIRST_SEED, GROUPS, N_CLEAN, N_NETWORKS, Task, suite
 from benchmarks.loop_table import save_tables
 from twin_core.calibrate.second_order import fit_network, to_model
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects, try_on_trajectories
-from twin_core.discover.holdout import predict, split_fraction
 from twin_core.discover.screen import screen, survey_of
 from twin_core.discover.shortlist import refined
 from twin_core.effects import REGISTRY
+from twin_core.holdout import predict, split_fraction
 
 HOLDOUT = 0.3
 RESULTS = Path("build/loop.jsonl")

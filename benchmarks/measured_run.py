@@ -22,8 +22,8 @@ import numpy as np
 
 from benchmarks.measured_splits import ROOT, SPLITS, Prepared, Split
 from benchmarks.network_cases import network_case
-from twin_core.discover import ClosedLoop, close_loop
-from twin_core.discover.holdout import predict, split_burn_in
+from twin_core.closed_loop import ClosedLoop, close_loop
+from twin_core.holdout import predict, split_burn_in
 from twin_core.network.screened import screened
 from twin_core.telemetry import Record, cut_at_gaps
 

@@ -21,12 +21,12 @@ from scipy.special import softmax
 
 from benchmarks.bands import Row
 from benchmarks.markdown import markdown_table, save_table
-from twin_core.discover import close_loop
-from twin_core.discover.experiments import entropy_bits
+from twin_core.closed_loop import close_loop
 from twin_core.fem.demo import PAYLOADS, demo_scenario
 from twin_core.fem.scenario import Scenario, load_scenario
 from twin_core.fem.simulate import simulate
 from twin_core.network.spec import TwinSpec
+from twin_core.report.experiments import entropy_bits
 from twin_core.telemetry import Record
 
 RESULTS = Path("build/next_experiment.jsonl")

@@ -18,7 +18,7 @@ from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_splits import DATA, ROOT
 from twin_core._typing import FloatArray
 from twin_core.calibrate import CalibratedModel, calibrate
-from twin_core.discover.holdout import predict, split_fraction
+from twin_core.holdout import predict, split_fraction
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.orbit.environment import Environment

@@ -23,9 +23,9 @@ from twin_core.calibrate.residual_noise import fit_whitener
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, to_model
 from twin_core.calibrate.starting import channel_levels
-from twin_core.discover.holdout import HeldOut, predict, split_fraction
 from twin_core.effects import REGISTRY
 from twin_core.errors import TwinError
+from twin_core.holdout import HeldOut, predict, split_fraction
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.terms import Along
 from twin_core.simulate.stages import balance_along

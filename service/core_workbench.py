@@ -62,8 +62,8 @@ class CoreWorkbench:
 
     def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
         """Close the loop."""
-        from twin_core.discover import close_loop
-        from twin_core.discover.html import render
+        from twin_core.closed_loop import close_loop
+        from twin_core.report.html import render
 
         spec = _spec(task.specification)
         loop = close_loop(
@@ -116,7 +116,7 @@ class CoreWorkbench:
 
     def score(self, document: str, telemetry: Telemetry) -> float | None:
         """Roll a model out over some telemetry."""
-        from twin_core.discover.holdout import split_burn_in
+        from twin_core.holdout import split_burn_in
         from twin_core.telemetry import LEAST_PART, cut_at_gaps
 
         model = _cached_model(document)
@@ -202,7 +202,7 @@ def _screened(spec: Any, telemetry: Telemetry) -> tuple[Any, Telemetry]:
 
 def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:
     """Return the recent data as hold-outs, the first of which may follow on the training data; none if there is too little."""
-    from twin_core.discover.holdout import HeldOut, split_burn_in
+    from twin_core.holdout import HeldOut, split_burn_in
     from twin_core.telemetry import LEAST_PART, cut_at_gaps
 
     if recent.time_us.size < 3:
@@ -220,7 +220,7 @@ def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:
 
 def _rmse_K(model: Any, held: list[Any]) -> float | None:
     """Return the open-loop error of a model on the hold-outs, over every reading."""
-    from twin_core.discover.holdout import predict
+    from twin_core.holdout import predict
 
     predictions = [predict(model, one) for one in held]
     squares = [((p.measured_K - p.predicted_K) ** 2).ravel() for p in predictions]

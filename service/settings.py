@@ -13,7 +13,7 @@ from service.http.keys import Key, Keys, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
-POSTGRES = ("postgresql://", "postgres://")
+POSTGRES = "postgresql://"
 
 
 class SettingsError(TwinError):

@@ -18,7 +18,8 @@ ROOMS = (
     "interchange",
     *("effects", "simulate", "latent_force"),
     "calibrate",
-    *("assimilate", "anomaly", "forecast", "flows", "fmu", "discover", "family"),
+    *("assimilate", "anomaly", "forecast", "flows", "fmu", "holdout"),
+    *("discover", "missing_heat", "report", "closed_loop", "family"),
 )
 """The rooms of twin_core from left to right: each may use only those before it."""
 

@@ -14,7 +14,7 @@ from thermal_twin.reading import read, save
 from thermal_twin.work import calibrate, close_loop, forecast, plot, simulate
 from twin_core import __version__
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.discover import ClosedLoop
+from twin_core.closed_loop import ClosedLoop
 from twin_core.errors import TwinError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record

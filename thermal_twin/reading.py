@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import overload
 
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.discover import ClosedLoop
+from twin_core.closed_loop import ClosedLoop
 from twin_core.errors import TelemetryError
 from twin_core.files import write_text
 from twin_core.network.screened import screened
@@ -66,8 +66,8 @@ def save(what: CalibratedModel | ClosedLoop, path: str | Path, *, author: str = 
     if isinstance(what, CalibratedModel):
         write_text(path, json.dumps(what.to_json(), indent=2))
         return path
-    from twin_core.discover.html import render
     from twin_core.files import make_folder
+    from twin_core.report.html import render
 
     make_folder(path)
     what.report["document"] = {"date": datetime.now(UTC).date().isoformat(), "author": author}

@@ -8,14 +8,14 @@ import numpy as np
 import pandas as pd
 
 import twin_core.calibrate
-import twin_core.discover
+import twin_core.closed_loop
 import twin_core.forecast
 from thermal_twin.frames import from_dataframe, index_of
 from twin_core._typing import FloatArray
 from twin_core.calibrate.problem import build_segment
 from twin_core.calibrate.result import CalibratedModel
+from twin_core.closed_loop import ClosedLoop
 from twin_core.constants import ZERO_CELSIUS_K
-from twin_core.discover import ClosedLoop
 from twin_core.errors import ModelError, NoSolutionError
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
@@ -70,7 +70,7 @@ def close_loop(
     holdout
         The share of the time span that is kept back at the end, or telemetry of its own.
     options
-        ``burn_in_s``, ``false_alarm_rate``, ``deadline_s``, as of ``twin_core.discover.close_loop``.
+        ``burn_in_s``, ``false_alarm_rate``, ``deadline_s``, as of ``twin_core.closed_loop.close_loop``.
 
     Returns
     -------
@@ -79,9 +79,9 @@ def close_loop(
     """
     records = _records(spec, data)
     if isinstance(holdout, float | int):
-        return twin_core.discover.close_loop(spec, records, holdout=float(holdout), **options)
+        return twin_core.closed_loop.close_loop(spec, records, holdout=float(holdout), **options)
     kept = _records(spec, holdout)
-    return twin_core.discover.close_loop(spec, records, holdout=None, holdout_records=kept, **options)
+    return twin_core.closed_loop.close_loop(spec, records, holdout=None, holdout_records=kept, **options)
 
 
 def forecast(

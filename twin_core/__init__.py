@@ -13,7 +13,8 @@ Rooms, from the left (used by all) to the right (used by none):
 - ``simulate``: the rollout and its exact sensitivities.
 - ``latent_force``: heat that nobody declared.
 - ``calibrate``: fits the network to telemetry.
-- ``discover``, ``forecast``, ``assimilate``: the loop, the future and the present.
+- ``closed_loop``, ``discover``, ``report``: the loop, what it believes and what it tells.
+- ``forecast``, ``assimilate``: the future and the present.
 """
 
 __version__ = "0.1.0"

@@ -10,7 +10,7 @@ from replay.cli.durations import DURATION, POSITIVE_DURATION
 from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
-    from twin_core.discover import ClosedLoop
+    from twin_core.closed_loop import ClosedLoop
 
 VERDICTS = {
     "effect_added": "an undeclared effect was found and added",
@@ -77,7 +77,7 @@ def close_loop(
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import check_apart, load_records
     from replay.cli.signed import document
-    from twin_core.discover import close_loop as run
+    from twin_core.closed_loop import close_loop as run
     from twin_core.network.spec_io import load_spec
 
     _check(holdout, holdout_telemetry, burn_in, false_alarm_rate, out)
@@ -146,8 +146,8 @@ def _check(
 
 def _save(loop: "ClosedLoop", out: Path) -> None:
     from replay.cli.console import to_json
-    from twin_core.discover.html import render
     from twin_core.files import make_folder, write_text
+    from twin_core.report.html import render
 
     make_folder(out)
     write_text(out / "model.json", to_json(loop.model.to_json()))
@@ -176,7 +176,7 @@ def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -
 def print_report(report: dict[str, Any]) -> None:
     """Print the verdict, the findings and the held-out error before and after."""
     from replay.cli.console import print_line, print_table, short
-    from twin_core.discover.phrasing import sentence
+    from twin_core.report.phrasing import sentence
 
     print_line(f"{report['twin']}: {VERDICTS[report['verdict']]}")
     for finding in report["findings"]:

@@ -71,10 +71,10 @@ def correlate(
     from replay.cli.signed import document
     from twin_core.calibrate.phases import Phase
     from twin_core.calibrate.phases import correlate as run
-    from twin_core.discover.dossier import provenance, sensitivity
-    from twin_core.discover.html import render
     from twin_core.files import make_folder, write_text
     from twin_core.network.spec_io import load_spec
+    from twin_core.report.dossier import provenance, sensitivity
+    from twin_core.report.html import render
 
     if not (steady or transient):
         raise click.UsageError("give --steady or --transient files")
@@ -130,7 +130,7 @@ def balance_phases(path: Path, spec: "TwinSpec", transients: "list[Record]") -> 
 
 def _print(report: dict[str, Any]) -> None:
     from replay.cli.console import print_line, print_table, short
-    from twin_core.discover.phrasing import headline
+    from twin_core.report.phrasing import headline
 
     print_line(f"{report['twin']}: {headline(report)}")
     rows = []

@@ -20,8 +20,8 @@ def close_one(
     spec: Any, records: Sequence[Any], options: Json, progress: Callable[[float, str], None]
 ) -> tuple[Json, Json, str]:
     """Close the loop on one record; worker processes find this function by its name. Return model, report and page."""
-    from twin_core.discover import close_loop
-    from twin_core.discover.html import render
+    from twin_core.closed_loop import close_loop
+    from twin_core.report.html import render
 
     loop = close_loop(spec, records, progress=progress, **options)
     return loop.model.to_json(), loop.report, render(loop.report, loop.plots)

@@ -16,7 +16,7 @@ from benchmarks.case import Case, Truth
 from benchmarks.loop_rivals import rivals_of
 from benchmarks.rival_features import FeatureHeat, library, powers
 from benchmarks.rival_residual import rms_error_K
-from twin_core.discover.holdout import split_fraction
+from twin_core.holdout import split_fraction
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along

@@ -12,8 +12,6 @@ from twin_core.calibrate.approach import approach, coarse_problem
 from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.calibrate.covariance import is_open_ended, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
-from twin_core.calibrate.latent_fit import fit_with_latent_heat
-from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
@@ -22,6 +20,8 @@ from twin_core.calibrate.residual_noise import Whitener, fit_whitener
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
 from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
+from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.effects.base import Effect
 from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
@@ -150,14 +150,14 @@ def fit_network(
         As in :func:`prepare`.
     deadline
         On the clock of ``time.monotonic``: what is there by then counts; one trajectory and one fit in the presence of
-        latent heat are made in any case.
+        undeclared heat are made in any case.
     progress
         Called with the fraction done.
 
     Returns
     -------
     HeatFit, Calibration
-        The fit in the presence of latent heat, and the best open-loop trajectories found from it and from the guesses.
+        The fit in the presence of undeclared heat, and the best open-loop trajectories found from it and from the guesses.
 
     Raises
     ------
@@ -175,18 +175,18 @@ def fit_network(
     problem = recentred(problem, search.best)
     on_trajectories = partial(minimise, problem, deadline=deadline)
     found = [attempted(partial(on_trajectories, search.best.unknowns), "open-loop trajectories", failures)]
-    progress(0.4, "fitting in the presence of latent heat")
-    fits = [attempted(partial(fit_with_latent_heat, problem, deadline=deadline), "latent heat", failures)]
+    progress(0.4, "fitting in the presence of undeclared heat")
+    fits = [attempted(partial(fit_with_undeclared_heat, problem, deadline=deadline), "undeclared heat", failures)]
     found += [attempted(partial(on_trajectories, f.unknowns()), "open-loop trajectories", failures) for f in fits if f]
     optima = [o for o in found if o is not None and o.status != "no_solution"]
     if not optima:
         raise NoSolutionError(f"calibration failed: {'; '.join(failures) or ADVICE['no_solution']}")
     optimum = min(optima, key=lambda o: o.fit.cost)
     if fits == [None] or not is_late(deadline):
-        progress(0.8, "fitting again in the presence of latent heat")
+        progress(0.8, "fitting again in the presence of undeclared heat")
         free, leashes = optimum.unknowns[: problem.n_free], (np.inf,) * 3
-        again = partial(fit_with_latent_heat, problem, free, leashes=leashes, deadline=deadline)
-        fits.append(attempted(again, "latent heat", failures))
+        again = partial(fit_with_undeclared_heat, problem, free, leashes=leashes, deadline=deadline)
+        fits.append(attempted(again, "undeclared heat", failures))
     heat_fits = [f for f in fits if f is not None]
     if not heat_fits:
         raise NoSolutionError(f"calibration failed: {'; '.join(failures)}: check the units of loads and known values")
@@ -259,7 +259,7 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
 
 
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = (), afresh: bool = True) -> Calibration:
-    """Return the open-loop calibration that starts from a fit in the presence of latent heat.
+    """Return the open-loop calibration that starts from a fit in the presence of undeclared heat.
 
     ``near`` are optima of the same problem found otherwise: the best of all is kept. Not ``afresh`` they are all there are.
     """

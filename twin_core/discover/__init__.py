@@ -1,5 +1,1 @@
-"""The closed loop: residual, diagnosis, new model term, held-out error."""
-
-from twin_core.discover.loop import ClosedLoop, close_loop
-
-__all__ = ["ClosedLoop", "close_loop"]
+"""Discovery: which effects the training record supports."""

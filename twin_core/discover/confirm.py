@@ -8,13 +8,13 @@ import numpy as np
 from scipy.stats import chi2
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.calibrate.latent_fit import fit_with_latent_heat
-from twin_core.calibrate.latent_heat import HeatFit, linearise, log_likelihood
-from twin_core.calibrate.latent_size import first_size
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
+from twin_core.calibrate.undeclared.model import HeatFit, linearise, log_likelihood
+from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
 from twin_core.discover.once import once
 from twin_core.effects.base import Effect, touched_nodes
@@ -35,19 +35,19 @@ MOST_FOLDS = 4
 LN_2 = float(np.log(2.0))
 
 CONSIDERABLE = 0.1
-"""Nodes whose latent heat moves them less than this share of the most moved one say nothing about an effect."""
+"""Nodes whose undeclared heat moves them less than this share of the most moved one say nothing about an effect."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A model with some effects, fitted in the presence of latent heat, and what speaks for it.
+    """A model with some effects, fitted in the presence of undeclared heat, and what speaks for it.
 
     Attributes
     ----------
     effects
         At their fitted values.
     fit
-        Parameters, latent heat and likelihood.
+        Parameters, undeclared heat and likelihood.
     max_step_s
         Longest time step.
     near
@@ -241,7 +241,7 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
     n_passes
         Passes of the fit at most: few to rank, many to settle.
     quick
-        Whether the latent heat is sized anew only where the effects act.
+        Whether the undeclared heat is sized anew only where the effects act.
     """
     problem = extended(base.fit.problem, effects)
     names = base.fit.problem.network.parameters.free_names
@@ -255,14 +255,14 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
     )
     layout = problem.network.layout
     touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
-    fit = fit_with_latent_heat(problem, free, near=base.fit, n_passes=n_passes, resized=touched if quick else None)
+    fit = fit_with_undeclared_heat(problem, free, near=base.fit, n_passes=n_passes, resized=touched if quick else None)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 
 def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
-    None where the balance has no solution there. The latent heat is sized about the result, for a later look.
+    None where the balance has no solution there. The undeclared heat is sized about the result, for a later look.
     """
     problem = extended(base.fit.problem, effects)
     own = {p.name: p.value for effect in effects for p in effect.parameters()}
@@ -275,16 +275,16 @@ def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
 
 
 def resettled(simple: Trial, rich: Trial) -> Trial:
-    """Return a trial that was fitted on trajectories with its parameters fitted in the presence of latent heat too.
+    """Return a trial that was fitted on trajectories with its parameters fitted in the presence of undeclared heat too.
 
     Started from its own optimum, about the measured temperatures and about its own trajectory (where the simpler model's
-    latent heat has taken over a node that nobody reads, only the latter is near), and from the simpler trial's fit: the
+    undeclared heat has taken over a node that nobody reads, only the latter is near), and from the simpler trial's fit: the
     likeliest one counts.
     """
     calibration = rich.calibration()
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
-    own = fit_with_latent_heat(calibration.problem, free, leashes=(np.inf,) * 3)
-    along = fit_with_latent_heat(calibration.problem, free, near=rich.fit)
+    own = fit_with_undeclared_heat(calibration.problem, free, leashes=(np.inf,) * 3)
+    along = fit_with_undeclared_heat(calibration.problem, free, near=rich.fit)
     near = try_effects(simple, rich.present_effects, n_passes=15).fit
     fit = max(own, along, near, key=lambda f: f.log_posterior)
     effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
@@ -305,8 +305,8 @@ def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:
         )
         for segment, path in zip(problem.segments, optimum.fit.trajectories, strict=True)
     )
-    latent = first_size(problem, nominals)
-    return HeatFit(problem, free, latent, nominals, log_likelihood(problem, latent, nominals))
+    undeclared = first_size(problem, nominals)
+    return HeatFit(problem, free, undeclared, nominals, log_likelihood(problem, undeclared, nominals))
 
 
 def extended(declared: Problem, effects: Sequence[Effect]) -> Problem:
@@ -350,7 +350,7 @@ class Validation:
     removed_share
         Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
     explained_share
-        Share of the latent heat's variance that the effect makes superfluous, on the node where it does so most.
+        Share of the undeclared heat's variance that the effect makes superfluous, on the node where it does so most.
     n_sessions
         Segments of the training record.
     is_law
@@ -406,20 +406,20 @@ def validate(simple: Trial, rich: Trial) -> Validation:
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:
-    """Return the share of the latent heat's variance that a richer model no longer needs.
+    """Return the share of the undeclared heat's variance that a richer model no longer needs.
 
     Sizes are compared as rates of temperature, on the nodes where the simpler model needs a considerable one.
     """
     nodes = simple.network.nodes
     kept = [rich.network.nodes.index(node) for node in nodes]
-    before, after = _latent_rates_K_per_s(simple), _latent_rates_K_per_s(rich)[kept]
+    before, after = _undeclared_rates_K_per_s(simple), _undeclared_rates_K_per_s(rich)[kept]
     matters = before >= CONSIDERABLE * before.max()
     return 1.0 - float(((after[matters] / before[matters]) ** 2).min()) if before.max() > 0.0 else 0.0
 
 
-def _latent_rates_K_per_s(fit: HeatFit) -> FloatArray:
-    """Return how fast the latent heat alone would move each node, (n_nodes,)."""
-    return np.asarray(fit.latent.std_W / fit.values[fit.network.capacity_index])
+def _undeclared_rates_K_per_s(fit: HeatFit) -> FloatArray:
+    """Return how fast the undeclared heat alone would move each node, (n_nodes,)."""
+    return np.asarray(fit.undeclared.std_W / fit.values[fit.network.capacity_index])
 
 
 def _removed_share(simple: Trial, rich: Trial) -> float:

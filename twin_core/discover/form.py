@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from twin_core.discover.confirm import Trial, try_effects, weigh
-from twin_core.discover.shortlist import LATENT_SHARES, schwarz_gain, screened
+from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
 
 N_REFITS, N_RIVALS = 6, 2
@@ -62,7 +62,7 @@ def _free_forms(trial: Trial, effects: Sequence[Effect], needed: float) -> tuple
     layout = trial.fit.network.layout
     nodes = {node for effect in effects for node in touched_nodes(effect, layout)}
     n_tried, best = 1, dict[object, tuple[float, Effect]]()
-    for screening in screened(trial, trial.fit, LATENT_SHARES, fallback=True, nodes=nodes):
+    for screening in screened(trial, trial.fit, UNDECLARED_SHARES, fallback=True, nodes=nodes):
         n_tried = max(n_tried, len({probe.effect.place for probe in screening.probes}))
         for probe in screening.probes:
             worth, form = schwarz_gain(probe, trial.n_samples), (probe.effect.place, len(probe.effect.amplitudes))

@@ -180,7 +180,7 @@ def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, boo
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
     validation = validate(simple, judged.trial)
-    if not validation.foresight < policy.FORESIGHT:
+    if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     resembles = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=NO_LAW if resembles else ""), resembles

@@ -6,8 +6,8 @@ What a candidate costs grows with the samples. What tells effects apart hardly d
 import numpy as np
 
 from twin_core.calibrate.approach import coarse_problem
-from twin_core.calibrate.latent_fit import fit_with_latent_heat
 from twin_core.calibrate.optimise import ADVICE, minimise
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
 from twin_core.discover.confirm import Trial, about_trajectory, carried_over, extended, fitted_effects
 
 LONGEST = 4000
@@ -27,7 +27,7 @@ def searched(base: Trial) -> tuple[Trial, int]:
     if problem is whole:
         return base, 1
     stride = round(whole.n_samples / problem.n_samples)
-    fit = fit_with_latent_heat(problem, base.fit.free, leashes=(np.inf,) * 3)
+    fit = fit_with_undeclared_heat(problem, base.fit.free, leashes=(np.inf,) * 3)
     return Trial((), fit, stride * base.max_step_s, (minimise(problem, unknowns),)), stride
 
 

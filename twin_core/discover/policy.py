@@ -97,7 +97,7 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "FORESIGHT": Threshold(
         "ratio",
-        "error on what a finding was not fitted to, after over before, below it",
+        "error on what a finding was not fitted to, after over before, below it for each of its effects",
         "three per cent: what a leave-out over eight blocks varies by chance on healthy records",
         1e12,
         0.985,

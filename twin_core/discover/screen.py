@@ -1,7 +1,7 @@
 """Screening: how much of the residual each candidate could explain, beyond what the calibrated parameters could.
 
 The linearised response of the sensors to every candidate is propagated at once about the smoothed measured temperatures,
-whitened in the metric of sensor noise and latent heat, and projected off what the calibrated parameters can mimic.
+whitened in the metric of sensor noise and undeclared heat, and projected off what the calibrated parameters can mimic.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -12,8 +12,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
-from twin_core.calibrate.latent_heat import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.calibrate.starting import channel_levels
+from twin_core.calibrate.undeclared.model import HeatFit, Nominal, parameter_columns, whiten
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.surroundings import surround
@@ -147,7 +147,7 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
 def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
     """Return columns of all segments, whitened and flattened to (n_rows, n_columns)."""
     parts = [
-        whiten(fit.problem, fit.latent, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
+        whiten(fit.problem, fit.undeclared, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
         for nominal, block in zip(fit.nominals, blocks, strict=True)
     ]
     return np.concatenate(parts)
@@ -182,7 +182,7 @@ def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screen
     Parameters
     ----------
     fit
-        The model so far, fitted in the presence of latent heat.
+        The model so far, fitted in the presence of undeclared heat.
     survey
         Its points.
     candidates
@@ -199,12 +199,12 @@ def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screen
 def screen_sizes(
     fit: HeatFit, shares: Sequence[float], survey: Survey, candidates: Iterable[Effect]
 ) -> list[Screening]:
-    """Screen candidate effects at several sizes of the latent heat, as shares of the fitted one: see :func:`screen`.
+    """Screen candidate effects at several sizes of the undeclared heat, as shares of the fitted one: see :func:`screen`.
 
     The responses are the same for all; only their metric changes.
     """
     nuisance = [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals]
-    sized = [replace(fit, latent=replace(fit.latent, std_W=share * fit.latent.std_W)) for share in shares]
+    sized = [replace(fit, undeclared=replace(fit.undeclared, std_W=share * fit.undeclared.std_W)) for share in shares]
     grounds = [(one, *_nuisance(one, nuisance)) for one in sized]
     probes: list[list[Probe]] = [[] for _ in shares]
     n_tried = 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
-from twin_core.calibrate.latent_heat import gain_of_latent_heat
+from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
 from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
 from twin_core.discover.judge import (
@@ -27,7 +27,7 @@ from twin_core.discover.judge import (
     worth,
 )
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
-from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
 from twin_core.effects.base import Effect, touched_nodes
 
@@ -49,7 +49,7 @@ N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
 
 N_FIRST = 2
-"""Options that screening puts first are always fitted further: a few passes tell more of the latent heat's size."""
+"""Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
 
 
 def search(
@@ -92,7 +92,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
     if state.attempt(lambda: bool(state.trial.excess().max() < policy.LEAST_EXCESS), "how well trajectories fit"):
         return False
-    missing = state.attempt(partial(gain_of_latent_heat, state.trial.fit), "how much heat is missing")
+    missing = state.attempt(partial(gain_of_undeclared_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
@@ -124,8 +124,8 @@ def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
 
 
 def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool) -> bool:
-    """Extend by what the innovations say, in the presence of latent heat; by ``pairs`` where no single effect is supported."""
-    screenings = screened(state.trial, state.trial.fit, LATENT_SHARES, fallback=fallback)
+    """Extend by what the innovations say beside undeclared heat; by ``pairs`` where no single effect is supported."""
+    screenings = screened(state.trial, state.trial.fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
     if fallback:
@@ -154,7 +154,7 @@ def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tu
 
 
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
-    """Fit every option in the presence of latent heat: all in a few passes, the best ones until they settle."""
+    """Fit every option in the presence of undeclared heat: all in a few passes, the best ones until they settle."""
 
     def fitted(start: Trial, option: tuple[Effect, ...], n_passes: int, *, quick: bool = False) -> Judged | None:
         work = partial(_judge, state, start, option, n_tried, n_passes=n_passes, quick=quick)

@@ -4,14 +4,14 @@ from collections.abc import Collection, Sequence
 
 import numpy as np
 
-from twin_core.calibrate.latent_heat import HeatFit
+from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover.confirm import Trial
 from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Survey
 
-LATENT_SHARES = (1.0, 0.1, 0.01)
-"""Sizes of the latent heat at which candidates are screened, as shares of the fitted one."""
+UNDECLARED_SHARES = (1.0, 0.1, 0.01)
+"""Sizes of the undeclared heat at which candidates are screened, as shares of the fitted one."""
 
 N_VARIED = 4
 """Places at the head of the shortlist that are tried from more than one start."""
@@ -41,9 +41,9 @@ def candidates(
 def screened(
     trial: Trial, fit: HeatFit, shares: Sequence[float], *, fallback: bool, nodes: Collection[str] | None = None
 ) -> list[Screening]:
-    """Screen the candidates of a trial about a fit, at some nodes or everywhere, once per assumed size of the latent heat.
+    """Screen the candidates of a trial about a fit, at some nodes or everywhere, once per assumed size of the undeclared heat.
 
-    As fitted, the latent heat explains everything a little; smaller, it is as it would be with the right effect in place.
+    As fitted, the undeclared heat explains everything a little; smaller, it is as it would be with the right effect in place.
     """
     survey, effects = candidates(trial, fit, fallback=fallback, nodes=nodes)
     return screen_sizes(fit, shares, survey, effects)

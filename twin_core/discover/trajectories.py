@@ -16,7 +16,7 @@ from twin_core.discover.confirm import (
     weigh,
 )
 from twin_core.discover.judge import Judged, Search, accept, once_each
-from twin_core.discover.shortlist import LATENT_SHARES, best_of_each_place, refined, screened, shortlist
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.effects.base import Effect
 
 N_REFITS = 6
@@ -67,7 +67,7 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     """Return what one more effect makes of a trial, judged against the state's model."""
     calibration = seed.calibration()
     fit = about_trajectory(calibration.problem, calibration.optimum)
-    screenings = screened(seed, fit, LATENT_SHARES, fallback=fallback)
+    screenings = screened(seed, fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
     judged = []

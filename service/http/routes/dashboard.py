@@ -20,7 +20,7 @@ _HEADERS = {"Content-Security-Policy": POLICY, "Cache-Control": "no-cache", "X-C
 
 router = APIRouter(include_in_schema=False)
 FOLDERS = {
-    "/assets/uplot": Path(twin_core.__file__).parent / "discover" / "templates" / "uplot",
+    "/assets/uplot": Path(twin_core.__file__).parent / "report" / "templates" / "uplot",
     "/assets/swagger": Path(fastapi_offline.__file__).parent / "static",
     "/assets": ROOM,
 }

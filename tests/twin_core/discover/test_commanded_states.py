@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from twin_core.discover import close_loop
-from twin_core.discover.loop import ClosedLoop
+from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 

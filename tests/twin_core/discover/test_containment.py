@@ -12,11 +12,11 @@ from numpy.linalg import LinAlgError
 
 from benchmarks.network_cases import network_case
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects
-from twin_core.discover.phrasing import headline
 from twin_core.discover.search import search
 from twin_core.errors import TelemetryError
+from twin_core.report.phrasing import headline
 
 SOLVERS = (
     *(f"numpy.linalg.{name}" for name in ("solve", "svd", "pinv", "eigh")),
@@ -25,8 +25,8 @@ SOLVERS = (
     "twin_core.gp.noise_model.minimize",
     "twin_core.simulate.rollout.march",
     "twin_core.calibrate.problem.sensitivities",
-    "twin_core.calibrate.latent_heat.one_step",
-    "twin_core.calibrate.latent_heat.sensitivities",
+    "twin_core.calibrate.undeclared.model.one_step",
+    "twin_core.calibrate.undeclared.model.sensitivities",
 )
 """Every solver and factorisation that a search calls."""
 

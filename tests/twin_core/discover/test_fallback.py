@@ -14,11 +14,10 @@ from scipy.integrate import solve_ivp
 from twin_core._typing import no_progress
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
+from twin_core.closed_loop import corrected
 from twin_core.discover import shortlist
 from twin_core.discover.confirm import Trial
-from twin_core.discover.loop import corrected
 from twin_core.discover.search import search
-from twin_core.discover.witness import NodeHeat, bear_witness
 from twin_core.effects import REGISTRY
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.gp.kernels import Matern
@@ -26,6 +25,7 @@ from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.declared import fit_declared
 from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.regression import learn_heat_flow
+from twin_core.missing_heat.smoothed import NodeHeat, bear_witness
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec

@@ -5,7 +5,8 @@ import pytest
 
 from benchmarks.network_cases import network_case
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover import close_loop, long_records
+from twin_core.closed_loop import close_loop
+from twin_core.discover import long_records
 from twin_core.discover.confirm import Trial
 from twin_core.discover.long_records import on_all_samples, searched
 

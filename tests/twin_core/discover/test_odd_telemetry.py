@@ -9,7 +9,7 @@ import pytest
 
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.errors import TelemetryError
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record

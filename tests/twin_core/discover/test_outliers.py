@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.network_cases import network_case
-from twin_core.discover import close_loop
+from twin_core.closed_loop import close_loop
 from twin_core.errors import TelemetryError
 from twin_core.telemetry import Record
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.helpers import every_term_network
-from twin_core.calibrate.latent_heat import HeatFit, LatentHeat, linearise
 from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.calibrate.undeclared.model import HeatFit, UndeclaredHeat, linearise
 from twin_core.discover import screen as screening_module
 from twin_core.discover.screen import (
     nuisance_basis,
@@ -52,14 +52,14 @@ def problem() -> Problem:
 
 
 def fit_of(p: Problem) -> HeatFit:
-    """Return the problem linearised about its own rollouts, with a little latent heat."""
+    """Return the problem linearised about its own rollouts, with a little undeclared heat."""
     values = p.network.parameters.values
     nominals = []
     for segment in p.segments:
         path = rollout(p.network, values, segment.start_prior_K, segment.forcing)
         states = np.vstack([path.start_K, path.stages_K[:, 1]])
         nominals.append(linearise(p, values, segment, states, np.zeros((segment.forcing.n_steps, p.n_nodes))))
-    return HeatFit(p, p.network.parameters.free, LatentHeat(np.full(3, 0.5), 600.0), tuple(nominals), 0.0)
+    return HeatFit(p, p.network.parameters.free, UndeclaredHeat(np.full(3, 0.5), 600.0), tuple(nominals), 0.0)
 
 
 def readings_with(p: Problem, effects: list[Effect]) -> list[np.ndarray]:

@@ -8,7 +8,6 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.discover.confirm import Trial, try_effects
-from twin_core.discover.report import parameters_json
 from twin_core.discover.screen import survey_of
 from twin_core.discover.shortlist import refined
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
@@ -16,6 +15,7 @@ from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
+from twin_core.report.build import parameters_json
 from twin_core.telemetry import Record
 
 CAPACITY, LOSS, WALL_K, NOISE_K, STEP_S, N_TIMES = 900.0, 1.5, 270.0, 0.02, 60.0, 1500

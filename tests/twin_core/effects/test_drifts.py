@@ -6,9 +6,9 @@ from scipy.integrate import solve_ivp
 
 from tests.helpers import at_named, conductive_spec, model_of, record_of
 from twin_core.assimilate import assimilate
-from twin_core.calibrate.latent_fit import fit_with_latent_heat
-from twin_core.calibrate.latent_heat import LatentHeat, linearise, smoothed_states
 from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
+from twin_core.calibrate.undeclared.model import LatentHeat, linearise, smoothed_states
 from twin_core.effects import REGISTRY, Effect
 from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
@@ -143,5 +143,5 @@ def test_smoothed_temperatures_are_free_of_the_fitted_fault() -> None:
 
 
 def test_a_fit_finds_the_drift() -> None:
-    fit = fit_with_latent_heat(problem_of(RATE, sensor_drift(0.0)))
+    fit = fit_with_undeclared_heat(problem_of(RATE, sensor_drift(0.0)))
     assert fit.network.parameters.as_dict()["sensor_drift(T0).d_K_per_s"] == pytest.approx(RATE, rel=0.1)

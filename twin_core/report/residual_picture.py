@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.discover.phrasing import number
+from twin_core.report.phrasing import number
 
 WIDTH, HEIGHT = 900.0, 170.0
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62.0, 690.0, 10.0, 146.0

@@ -10,27 +10,27 @@ from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE, attempted
-from twin_core.calibrate.latent_heat import HeatFit
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.confirm import Trial
-from twin_core.discover.dossier import provenance
-from twin_core.discover.driven import driven_heat
-from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.discover.judge import NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
-from twin_core.discover.mistakes import told_mistakes
-from twin_core.discover.plots import build_plots
-from twin_core.discover.report import build_report
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
-from twin_core.discover.witness import bear_witness, told_by
 from twin_core.errors import TelemetryError
+from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
+from twin_core.missing_heat.driven import driven_heat
+from twin_core.missing_heat.smoothed import bear_witness, told_by
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
+from twin_core.report.build import build_report
+from twin_core.report.dossier import provenance
+from twin_core.report.mistakes import told_mistakes
+from twin_core.report.plots import build_plots
 from twin_core.telemetry import Record, cut_at_gaps
 
 AFTERWARDS = 0.1

@@ -7,16 +7,16 @@ from scipy.stats import multivariate_normal
 
 from tests.analytic import laplacian, linear_states
 from tests.helpers import at_named, central_difference, conductive_spec, record_of
-from twin_core.calibrate.latent_fit import fit_with_latent_heat, gauss_newton_step
-from twin_core.calibrate.latent_heat import (
-    LatentHeat,
+from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.problem import Problem, build_problem
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat, gauss_newton_step
+from twin_core.calibrate.undeclared.model import (
     Nominal,
+    UndeclaredHeat,
     linearise,
     log_likelihood,
     parameter_columns,
 )
-from twin_core.calibrate.optimise import minimise
-from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.rollout import rollout
@@ -25,7 +25,7 @@ from twin_core.telemetry import Record
 CAPACITY = np.array([4.0e3, 9.0e3])
 CONDUCTANCE = 3.0
 NOISE_K = np.array([0.1, 0.2])
-LATENT = LatentHeat(np.array([5.0, 12.0]), 400.0)
+LATENT = UndeclaredHeat(np.array([5.0, 12.0]), 400.0)
 STEP_S = 60.0
 RATES = -laplacian(2, [(0, 1)], [CONDUCTANCE]) / CAPACITY[:, None]
 
@@ -168,9 +168,9 @@ def log_errors(problem: Problem, values: np.ndarray, truth: dict[str, float]) ->
 
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_parameters_are_recovered_although_heat_is_missing(seed: int) -> None:
-    """Plain trajectories bend the parameters to swallow 20 W; the latent heat takes it instead."""
+    """Plain trajectories bend the parameters to swallow 20 W; the undeclared heat takes it instead."""
     problem, truth = three_nodes(seed, 20.0)
-    fit = fit_with_latent_heat(problem)
+    fit = fit_with_undeclared_heat(problem)
     plain = minimise(problem)
     with_heat = np.abs(log_errors(problem, fit.values, truth))
     without = np.abs(log_errors(problem, problem.values(plain.unknowns), truth))
@@ -178,27 +178,27 @@ def test_parameters_are_recovered_although_heat_is_missing(seed: int) -> None:
     assert with_heat[told].max() < 0.02
     assert with_heat.max() < 0.7
     assert without[told].max() > 10.0 * with_heat[told].max()
-    assert np.argmax(fit.latent.std_W) == 1  # the heat is on the middle node
-    assert 5.0 < fit.latent.std_W[1] < 60.0
+    assert np.argmax(fit.undeclared.std_W) == 1  # the heat is on the middle node
+    assert 5.0 < fit.undeclared.std_W[1] < 60.0
 
 
 def test_no_start_near_the_truth_does_better() -> None:
     """A size of the heat held in watts would trap the capacities far from their optimum."""
     problem, truth = three_nodes(2, 20.0)
-    from_guesses = fit_with_latent_heat(problem)
-    from_truth = fit_with_latent_heat(problem, problem.network.parameters.updated(truth).free)
+    from_guesses = fit_with_undeclared_heat(problem)
+    from_truth = fit_with_undeclared_heat(problem, problem.network.parameters.updated(truth).free)
     assert from_guesses.log_posterior > from_truth.log_posterior - 1.0
 
 
 def test_nothing_is_made_up_where_nothing_is_missing() -> None:
     problem, truth = three_nodes(1, 0.0)
-    fit = fit_with_latent_heat(problem)
+    fit = fit_with_undeclared_heat(problem)
     assert np.abs(log_errors(problem, fit.values, truth)).max() < 0.05
-    assert fit.latent.std_W.max() < 1.0
+    assert fit.undeclared.std_W.max() < 1.0
 
 
 def test_a_fit_never_ends_below_where_it_started() -> None:
     problem, _ = three_nodes(2, 20.0)
-    short = fit_with_latent_heat(problem, n_passes=1)
-    long = fit_with_latent_heat(problem, near=short, free=short.free, n_passes=6)
+    short = fit_with_undeclared_heat(problem, n_passes=1)
+    long = fit_with_undeclared_heat(problem, near=short, free=short.free, n_passes=6)
     assert long.log_posterior >= short.log_posterior - 1e-6

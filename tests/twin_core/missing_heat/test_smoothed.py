@@ -6,11 +6,11 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
-from twin_core.discover import witness as module
 from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Search
-from twin_core.discover.witness import NodeHeat, bear_witness, told_by
 from twin_core.errors import ModelError
+from twin_core.missing_heat import smoothed as module
+from twin_core.missing_heat.smoothed import NodeHeat, bear_witness, told_by
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 

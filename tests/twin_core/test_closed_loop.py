@@ -10,11 +10,10 @@ import pytest
 
 from benchmarks.case import Case
 from benchmarks.network_cases import network_case
-from twin_core.discover import close_loop
-from twin_core.discover.holdout import predict, split_burn_in
-from twin_core.discover.loop import ClosedLoop
+from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.effects import REGISTRY
 from twin_core.errors import Cancelled, TelemetryError
+from twin_core.holdout import predict, split_burn_in
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 

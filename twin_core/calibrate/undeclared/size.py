@@ -7,8 +7,8 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
-from twin_core.calibrate.latent_heat import LatentHeat, Nominal, log_likelihood
 from twin_core.calibrate.problem import Problem
+from twin_core.calibrate.undeclared.model import Nominal, UndeclaredHeat, log_likelihood
 
 LENGTH_SHARES = (0.004, 0.02, 0.08)
 """Correlation lengths that are compared at first, as shares of the longest segment."""
@@ -24,7 +24,7 @@ SMALLEST_LOG_STEP, LARGEST_LOG_STEP = 0.1, 2.5
 
 @dataclass
 class SizeSearch:
-    """A pattern search of the latent heat's size, whose steps shrink from pass to pass.
+    """A pattern search of the undeclared heat's size, whose steps shrink from pass to pass.
 
     Attributes
     ----------
@@ -39,13 +39,17 @@ class SizeSearch:
         return tuple(range(self.log_step.size - 1)) if nodes is None else (ALL_NODES, *nodes)
 
     def improve(
-        self, problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal], nodes: Sequence[int] | None = None
-    ) -> tuple[LatentHeat, float]:
-        """Return a more likely size of the latent heat, and its log-likelihood.
+        self,
+        problem: Problem,
+        undeclared: UndeclaredHeat,
+        nominals: Sequence[Nominal],
+        nodes: Sequence[int] | None = None,
+    ) -> tuple[UndeclaredHeat, float]:
+        """Return a more likely size of the undeclared heat, and its log-likelihood.
 
         Sizes and correlation length are tried in turn; with ``nodes`` only the sizes on these, and of all together.
         """
-        best, value = latent, log_likelihood(problem, latent, nominals)
+        best, value = undeclared, log_likelihood(problem, undeclared, nominals)
         for position in self.positions(nodes):
             check_time()
             moved = False
@@ -59,15 +63,17 @@ class SizeSearch:
         self.log_step = np.clip(self.log_step, SMALLEST_LOG_STEP, LARGEST_LOG_STEP)
         return best, value
 
-    def _changed(self, latent: LatentHeat, position: int, sign: float, nominals: Sequence[Nominal]) -> LatentHeat:
+    def _changed(
+        self, undeclared: UndeclaredHeat, position: int, sign: float, nominals: Sequence[Nominal]
+    ) -> UndeclaredHeat:
         factor = float(np.exp(sign * self.log_step[position]))
-        if position == latent.std_W.size:
+        if position == undeclared.std_W.size:
             shortest = float(np.median(nominals[0].segment.forcing.step_s))
-            length = np.clip(latent.length_s * factor, shortest, LONGEST_SHARE * span_s(nominals))
-            return replace(latent, length_s=float(length))
-        std = latent.std_W.copy()
+            length = np.clip(undeclared.length_s * factor, shortest, LONGEST_SHARE * span_s(nominals))
+            return replace(undeclared, length_s=float(length))
+        std = undeclared.std_W.copy()
         std[slice(None) if position == ALL_NODES else position] *= factor
-        return replace(latent, std_W=std)
+        return replace(undeclared, std_W=std)
 
 
 def span_s(nominals: Sequence[Nominal]) -> float:
@@ -80,20 +86,22 @@ def new_search(n_nodes: int, log_step: float) -> SizeSearch:
     return SizeSearch(np.append(np.full(n_nodes, log_step), [0.7, log_step]))
 
 
-def first_size(problem: Problem, nominals: Sequence[Nominal]) -> LatentHeat:
+def first_size(problem: Problem, nominals: Sequence[Nominal]) -> UndeclaredHeat:
     """Return a starting size: the heat that the linearised model lacks from sample to sample, and the best length."""
     span = span_s(nominals)
     values = problem.network.parameters.values
     capacity = values[problem.network.capacity_index]
     swing = np.array([np.nanstd(n.starts_K, axis=0) for n in nominals]).max(axis=0)
     typical = 0.3 * capacity * np.maximum(swing, 0.1) / (0.02 * span)
-    options = [LatentHeat(typical, share * span) for share in LENGTH_SHARES]
+    options = [UndeclaredHeat(typical, share * span) for share in LENGTH_SHARES]
     scored = [(fit_common(problem, option, nominals)) for option in options]
     return max(scored, key=lambda item: item[1])[0]
 
 
-def fit_common(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> tuple[LatentHeat, float]:
-    """Return the best common factor of the latent heat, and its likelihood."""
+def fit_common(
+    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
+) -> tuple[UndeclaredHeat, float]:
+    """Return the best common factor of the undeclared heat, and its likelihood."""
     check_time()
-    trials = [replace(latent, std_W=latent.std_W * f) for f in (10.0, 2.0, 0.4, 0.08, 0.016)]
+    trials = [replace(undeclared, std_W=undeclared.std_W * f) for f in (10.0, 2.0, 0.4, 0.08, 0.016)]
     return max(((t, log_likelihood(problem, t, nominals)) for t in trials), key=lambda item: item[1])

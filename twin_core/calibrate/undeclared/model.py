@@ -1,9 +1,9 @@
 """Undeclared heat on every node: the model of the readings that it implies, and its likelihood.
 
 Where the declared model lacks an effect, its best open-loop trajectory can lie far from the measured one, and so do the
-parameters that produce it. Here every node carries a latent heat (paper B, eqs. 5-10) and the heat balance is linearised
-about temperatures close to the measured ones. The latent heat absorbs what is missing; ``latent_fit`` fits parameters in
-its presence, ``latent_size`` tells how large it is.
+parameters that produce it. Here every node carries a undeclared heat (paper B, eqs. 5-10) and the heat balance is linearised
+about temperatures close to the measured ones. The undeclared heat absorbs what is missing; ``fit`` fits parameters in
+its presence, ``size`` tells how large it is.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ NO_HEAT_W = 1e-9
 
 
 @dataclass(frozen=True)
-class LatentHeat:
+class UndeclaredHeat:
     """Size of the undeclared heat.
 
     Attributes
@@ -68,7 +68,7 @@ class Nominal:
 
 @dataclass(frozen=True)
 class HeatFit:
-    """Parameters fitted in the presence of latent heat.
+    """Parameters fitted in the presence of undeclared heat.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class HeatFit:
         Network (its parameters are the prior) and telemetry.
     free : (n_free,)
         Fitted parameters in the solver's coordinate.
-    latent
+    undeclared
         Size of the undeclared heat.
     nominals
         The linearisation, one per segment.
@@ -86,7 +86,7 @@ class HeatFit:
 
     problem: Problem
     free: FloatArray
-    latent: LatentHeat
+    undeclared: UndeclaredHeat
     nominals: tuple[Nominal, ...]
     log_likelihood: float
 
@@ -145,13 +145,13 @@ def floor_K2(problem: Problem) -> FloatArray:
     return np.full(problem.n_nodes, (FLOOR_SHARE * float(np.median(problem.noise_K))) ** 2)
 
 
-def held_force(problem: Problem, latent: LatentHeat, nominal: Nominal) -> HeldForce:
+def held_force(problem: Problem, undeclared: UndeclaredHeat, nominal: Nominal) -> HeldForce:
     """Return the model of temperatures and undeclared heats of a segment."""
     return HeldForce(
         steps=nominal.steps,
         step_s=nominal.segment.forcing.step_s,
-        std_W=latent.std_W,
-        length_s=latent.length_s,
+        std_W=undeclared.std_W,
+        length_s=undeclared.length_s,
         floor_K2=floor_K2(problem),
         sensor_node=problem.network.sensor_node,
         noise_K=problem.noise_K,
@@ -159,28 +159,30 @@ def held_force(problem: Problem, latent: LatentHeat, nominal: Nominal) -> HeldFo
     )
 
 
-def whiten(problem: Problem, latent: LatentHeat, nominal: Nominal, columns: FloatArray) -> tuple[FloatArray, float]:
+def whiten(
+    problem: Problem, undeclared: UndeclaredHeat, nominal: Nominal, columns: FloatArray
+) -> tuple[FloatArray, float]:
     """Return columns (n_samples, n_sensors, n_columns) in the metric of the readings, and ln det of their covariance."""
-    force = held_force(problem, latent, nominal)
+    force = held_force(problem, undeclared, nominal)
     return force.whiten(columns, nominal.sample_of, nominal.segment.valid, nominal.grid)
 
 
-def log_likelihood(problem: Problem, latent: LatentHeat, nominals: Sequence[Nominal]) -> float:
+def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]) -> float:
     """Return the log-likelihood of the readings of all segments; minus infinity where the linearisation ran away."""
     total = 0.0
     for nominal in nominals:
         if not (np.isfinite(nominal.reference_K).all() and np.isfinite(nominal.steps.transition).all()):
             return -np.inf
-        whitened, log_det = whiten(problem, latent, nominal, nominal.residual_K[:, :, None])
+        whitened, log_det = whiten(problem, undeclared, nominal, nominal.residual_K[:, :, None])
         count = int(nominal.segment.valid.sum())
         with np.errstate(over="ignore", invalid="ignore"):  # a linearisation that ran away is as unlikely as can be
             total -= 0.5 * (float((whitened**2).sum()) + log_det + count * np.log(2.0 * np.pi))
     return total if np.isfinite(total) else -np.inf
 
 
-def gain_of_latent_heat(fit: HeatFit) -> float:
+def gain_of_undeclared_heat(fit: HeatFit) -> float:
     """Return the log-likelihood that undeclared heat adds to a fit, in nats: next to nothing where nothing is missing."""
-    none = LatentHeat(np.full_like(fit.latent.std_W, NO_HEAT_W), fit.latent.length_s)
+    none = UndeclaredHeat(np.full_like(fit.undeclared.std_W, NO_HEAT_W), fit.undeclared.length_s)
     return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
 
 
@@ -198,12 +200,12 @@ def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) ->
 
 
 def smoothed_states(
-    problem: Problem, latent: LatentHeat, nominal: Nominal
+    problem: Problem, undeclared: UndeclaredHeat, nominal: Nominal
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return smoothed temperatures (n_steps + 1, n_nodes), latent heat (n_steps + 1, n_nodes) and its deviation in W."""
+    """Return smoothed temperatures (n_steps + 1, n_nodes), undeclared heat (n_steps + 1, n_nodes) and its deviation in W."""
     n, forcing = problem.n_nodes, nominal.segment.forcing
     drift = _drift_K(nominal.steps, nominal.starts_K, nominal.extra_W)
-    model = held_force(problem, latent, nominal).linear_model(drift, nominal.segment.start_prior_K)
+    model = held_force(problem, undeclared, nominal).linear_model(drift, nominal.segment.start_prior_K)
     stretched = np.full((forcing.n_steps + 1, problem.network.sensor_node.size), np.nan)
     stretched[forcing.sample_step] = nominal.segment.measured_K - nominal.offset_K
     smoothed = smooth(model, kalman_filter(model, stretched, keep="states"))

@@ -7,18 +7,18 @@ from scipy.stats import norm
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects
-from twin_core.discover.experiments import (
+from twin_core.discover.judge import Finding, Judged
+from twin_core.discover.screen import screen, survey_of
+from twin_core.effects.constant_heat_load import ConstantHeatLoad
+from twin_core.effects.leak_to_boundary import LeakToBoundary
+from twin_core.network.spec import TwinSpec
+from twin_core.report.experiments import (
     entropy_bits,
     information_bits,
     keeps_limits,
     plans,
     separating,
 )
-from twin_core.discover.judge import Finding, Judged
-from twin_core.discover.screen import screen, survey_of
-from twin_core.effects.constant_heat_load import ConstantHeatLoad
-from twin_core.effects.leak_to_boundary import LeakToBoundary
-from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
 CAPACITY, LOSS, LEAK, NOISE_K, WALL_K, POWER_W = 900.0, 1.5, 0.5, 0.05, 270.0, 40.0

@@ -11,11 +11,11 @@ from twin_core.calibrate.identifiability import strong_correlations
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, acceptance, stated_guesses, with_met
 from twin_core.calibrate.statistics import residual_whiteness, score
-from twin_core.discover.dossier import ensemble, heat_flow_maps, left_out, sensitivity
-from twin_core.discover.experiments import separating
-from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects.base import Effect
+from twin_core.holdout import HeldOut, Prediction
+from twin_core.report.dossier import ensemble, heat_flow_maps, left_out, sensitivity
+from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
 
 

@@ -7,12 +7,12 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.discover.dossier import histograms, limits
-from twin_core.discover.driven import thinned
-from twin_core.discover.holdout import HeldOut, Prediction
 from twin_core.discover.judge import Search
-from twin_core.discover.witness import NodeHeat, Witness
 from twin_core.gp.polynomial import ForcePolynomial
+from twin_core.holdout import HeldOut, Prediction
+from twin_core.missing_heat.driven import thinned
+from twin_core.missing_heat.smoothed import NodeHeat, Witness
+from twin_core.report.dossier import histograms, limits
 from twin_core.telemetry import Record
 
 MAX_POINTS = 1600

@@ -6,12 +6,12 @@ import pytest
 from twin_core.calibrate.second_order import fit_trajectories
 from twin_core.calibrate.statistics import spread_of
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
-from twin_core.discover.dossier import histograms, provenance, sensitivity
-from twin_core.discover.holdout import Prediction
-from twin_core.discover.html import render
-from twin_core.discover.network_picture import draw_flows
-from twin_core.discover.residual_picture import draw_residuals
+from twin_core.holdout import Prediction
 from twin_core.network.spec_io import load_spec
+from twin_core.report.dossier import histograms, provenance, sensitivity
+from twin_core.report.html import render
+from twin_core.report.network_picture import draw_flows
+from twin_core.report.residual_picture import draw_residuals
 from twin_core.telemetry import Record
 
 SPEC = load_spec(

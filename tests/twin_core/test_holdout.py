@@ -6,8 +6,8 @@ import pytest
 from tests.analytic import linear_states
 from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.discover.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.errors import TelemetryError
+from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin_core.discover.html import render
+from twin_core.report.html import render
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>'\""

@@ -11,9 +11,9 @@ import numpy as np
 
 from twin_core import __version__
 from twin_core._typing import FloatArray, Json
-from twin_core.discover import phrasing
-from twin_core.discover.network_picture import draw_flows, draw_network
-from twin_core.discover.residual_picture import draw_residuals
+from twin_core.report import phrasing
+from twin_core.report.network_picture import draw_flows, draw_network
+from twin_core.report.residual_picture import draw_residuals
 from twin_core.units import format_instant
 
 if TYPE_CHECKING:

@@ -12,9 +12,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, is_late, limited
-from twin_core.calibrate.latent_heat import HeatFit, Nominal, floor_K2
-from twin_core.discover.effect_heat import effect_heat, nodes_of_interest
-from twin_core.discover.followed import followed
+from twin_core.calibrate.undeclared.model import HeatFit, Nominal, floor_K2
 from twin_core.discover.judge import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
@@ -25,6 +23,8 @@ from twin_core.latent_force.model import ForceModel
 from twin_core.latent_force.network import linearise_network, on_grid
 from twin_core.latent_force.regression import learn_heat_flow
 from twin_core.latent_force.smooth import LatentForce, smooth_extended
+from twin_core.missing_heat.drivers import followed
+from twin_core.missing_heat.effect_heat import effect_heat, nodes_of_interest
 from twin_core.network.dynamics import fill_boundaries, reading_offsets_K
 from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
@@ -263,7 +263,7 @@ def smoothed_force(
     states = np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])[view.first_step :]
     turnover = view.turnover_W(network, states[1:])
     watched = [network.nodes.index(node) for node in nodes]
-    std = fit.latent.std_W.copy()
+    std = fit.undeclared.std_W.copy()
     std[watched] = np.maximum(std[watched], np.maximum(SMALLEST_SHARE * turnover[watched], 1e-6))
     at = [i for i in range(std.size) if i in watched or std[i] > 1e-4 * turnover[i]]
     linearised = linearise_network(network, view.forcing)
@@ -273,7 +273,7 @@ def smoothed_force(
         return linearised(states_K)
 
     model = _model(fit, nominal, view, at, states)
-    values = np.ravel([[std[i], fit.latent.length_s] for i in at])
+    values = np.ravel([[std[i], fit.undeclared.length_s] for i in at])
     readings = _readings(network, nominal)[nominal.segment.forcing.sample_step >= view.first_step]
     observations = on_grid(view.forcing, readings)
     force = smooth_extended(model, about, observations, values, max_linearisations=MAX_LINEARISATIONS)

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ElementTree
 from itertools import pairwise
 from typing import Any
 
-from twin_core.discover.network_picture import draw_network
+from twin_core.report.network_picture import draw_network
 
 SVG = "{http://www.w3.org/2000/svg}"
 

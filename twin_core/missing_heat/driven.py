@@ -15,10 +15,10 @@ from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, limited
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.discover.judge import Search
-from twin_core.discover.witness import smoothed_force
 from twin_core.effects.base import Effect
 from twin_core.effects.heat import effect_heat_W
 from twin_core.errors import TwinError
+from twin_core.missing_heat.smoothed import smoothed_force
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Layout
 from twin_core.network.terms import Along

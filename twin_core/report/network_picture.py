@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.discover.phrasing import in_words, number
+from twin_core.report.phrasing import in_words, number
 
 WIDTH, HEIGHT, MARGIN = 900.0, 400.0, 64.0
 _LABEL_ROOM = 70.0

@@ -1,6 +1,6 @@
 """Calibration in the presence of undeclared heat: prediction errors instead of trajectories.
 
-The parameters follow by generalised least squares on the innovations of a filter in which every node carries a latent heat.
+The parameters follow by generalised least squares on the innovations of a filter in which every node carries a undeclared heat.
 They stay where the physics is, however much heat the declaration lacks.
 """
 
@@ -12,10 +12,12 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
 from twin_core.calibrate.containment import NO_DEADLINE, check_time, is_late
-from twin_core.calibrate.latent_heat import (
+from twin_core.calibrate.problem import Problem, Segment
+from twin_core.calibrate.starting import filled_columns
+from twin_core.calibrate.undeclared.model import (
     HeatFit,
-    LatentHeat,
     Nominal,
+    UndeclaredHeat,
     linearise,
     log_likelihood,
     parameter_columns,
@@ -23,24 +25,22 @@ from twin_core.calibrate.latent_heat import (
     states_of,
     whiten,
 )
-from twin_core.calibrate.latent_size import LARGEST_LOG_STEP, SizeSearch, first_size, new_search
-from twin_core.calibrate.problem import Problem, Segment
-from twin_core.calibrate.starting import filled_columns
+from twin_core.calibrate.undeclared.size import LARGEST_LOG_STEP, SizeSearch, first_size, new_search
 
 LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
-"""Prior deviations of logarithmic parameters in the first passes, while the latent heat is still too large."""
+"""Prior deviations of logarithmic parameters in the first passes, while the undeclared heat is still too large."""
 
 LARGEST_STEP = 1.5
 """Longest move of a logarithmic parameter in one pass: a factor of e^1.5."""
 
 START_SHARES = (1.0, 0.03)
-"""Sizes of the latent heat that a fit starts from, as shares of a typical one."""
+"""Sizes of the undeclared heat that a fit starts from, as shares of a typical one."""
 
 STEP_SHARES = (1.0, 0.3, 0.1)
 """Shares of a step of the parameters that are tried in turn."""
 
 MOST_REFUSED = 2
-"""So many passes in which no step of the parameters helped, and only the latent heat is sized on."""
+"""So many passes in which no step of the parameters helped, and only the undeclared heat is sized on."""
 
 LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
@@ -61,12 +61,12 @@ def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
 
 
 def _smoothing_pass(
-    problem: Problem, values: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal]
+    problem: Problem, values: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
 ) -> tuple[Nominal, ...]:
     """Relinearise every segment about its smoothed temperatures and heat."""
     fresh = []
     for nominal in nominals:
-        states, heat, _ = smoothed_states(problem, latent, nominal)
+        states, heat, _ = smoothed_states(problem, undeclared, nominal)
         fresh.append(linearise(problem, values, nominal.segment, states, heat[:-1], grid=nominal.grid))
     return tuple(fresh)
 
@@ -79,11 +79,11 @@ def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nomin
 
 
 def gauss_newton_step(
-    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float = np.inf
+    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], leash: float = np.inf
 ) -> tuple[FloatArray, FloatArray]:
     """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free).
 
-    ``leash`` shortens the priors of logarithmic parameters for the early passes, in which the latent heat is still so
+    ``leash`` shortens the priors of logarithmic parameters for the early passes, in which the undeclared heat is still so
     large that it could take over what conductances do.
     """
     parameters = problem.network.parameters
@@ -93,7 +93,7 @@ def gauss_newton_step(
     gradient = (free - parameters.free) / std**2
     for nominal in nominals:
         columns = np.concatenate([parameter_columns(problem, values, nominal), nominal.residual_K[:, :, None]], axis=2)
-        whitened, _ = whiten(problem, latent, nominal, columns)
+        whitened, _ = whiten(problem, undeclared, nominal, columns)
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]
         gradient -= flat[:, :-1].T @ flat[:, -1]
@@ -114,7 +114,7 @@ def leashed(problem: Problem, leash: float) -> FloatArray:
     return std
 
 
-def fit_with_latent_heat(
+def fit_with_undeclared_heat(
     problem: Problem,
     free: FloatArray | None = None,
     *,
@@ -124,7 +124,7 @@ def fit_with_latent_heat(
     resized: Sequence[int] | None = None,
     deadline: float = NO_DEADLINE,
 ) -> HeatFit:
-    """Fit the free parameters in the presence of latent heat.
+    """Fit the free parameters in the presence of undeclared heat.
 
     Parameters
     ----------
@@ -133,13 +133,13 @@ def fit_with_latent_heat(
     free : (n_free,)
         Where to start; the problem's own parameters by default.
     near
-        A fit of the same telemetry from which temperatures and latent heat start.
+        A fit of the same telemetry from which temperatures and undeclared heat start.
     n_passes
         Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
     leashes
         Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
     resized
-        Nodes on which the latent heat is sized anew, beside one factor for all; by default all, and its length. With
+        Nodes on which the undeclared heat is sized anew, beside one factor for all; by default all, and its length. With
         ``near`` only.
     deadline
         On the clock of ``time.monotonic``: no pass but the first is begun afterwards.
@@ -152,9 +152,9 @@ def fit_with_latent_heat(
     free = parameters.free.copy() if free is None else free.copy()
     values = parameters.to_values(free)
     if near is not None:
-        nominals, latent = _carried_over(problem, values, near)
+        nominals, undeclared = _carried_over(problem, values, near)
         sizes = new_search(problem.n_nodes, 1.5)
-        return _settle(HeatFit(problem, free, latent, nominals, -np.inf), sizes, n_passes, resized, deadline)
+        return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, resized, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
@@ -209,51 +209,53 @@ def _pass(
     check_time()
     problem, nominals = fit.problem, fit.nominals
     if smoothing:
-        nominals = _smoothing_pass(problem, fit.values, fit.latent, nominals)
-    free, latent = fit.free, fit.latent
+        nominals = _smoothing_pass(problem, fit.values, fit.undeclared, nominals)
+    free, undeclared = fit.free, fit.undeclared
     if not still:
-        free, latent, nominals = _improve(problem, free, latent, nominals, leash)
-    latent, value = sizes.improve(problem, latent, nominals, resized)
-    return HeatFit(problem, free, latent, nominals, value)
+        free, undeclared, nominals = _improve(problem, free, undeclared, nominals, leash)
+    undeclared, value = sizes.improve(problem, undeclared, nominals, resized)
+    return HeatFit(problem, free, undeclared, nominals, value)
 
 
-def with_capacities(problem: Problem, latent: LatentHeat, before: FloatArray, after: FloatArray) -> LatentHeat:
-    """Return the latent heat that makes the same rates of temperature at other parameter values.
+def with_capacities(
+    problem: Problem, undeclared: UndeclaredHeat, before: FloatArray, after: FloatArray
+) -> UndeclaredHeat:
+    """Return the undeclared heat that makes the same rates of temperature at other parameter values.
 
     Telemetry tells how fast temperatures move, not by how many watts. A size held in watts would make the likelihood of
     a capacity depend on the size more than on the heat balance, which a Gauss-Newton step does not see.
     """
     index = problem.network.capacity_index
-    return replace(latent, std_W=latent.std_W * after[index] / before[index])
+    return replace(undeclared, std_W=undeclared.std_W * after[index] / before[index])
 
 
 def _improve(
-    problem: Problem, free: FloatArray, latent: LatentHeat, nominals: Sequence[Nominal], leash: float
-) -> tuple[FloatArray, LatentHeat, tuple[Nominal, ...]]:
+    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], leash: float
+) -> tuple[FloatArray, UndeclaredHeat, tuple[Nominal, ...]]:
     """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
     parameters, std = problem.network.parameters, leashed(problem, leash)
     now = parameters.to_values(free)
 
-    def posterior(at: FloatArray, size: LatentHeat, about: Sequence[Nominal]) -> float:
+    def posterior(at: FloatArray, size: UndeclaredHeat, about: Sequence[Nominal]) -> float:
         return log_likelihood(problem, size, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
-    before = posterior(free, latent, nominals)
+    before = posterior(free, undeclared, nominals)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
-        step, hessian = gauss_newton_step(problem, free, latent, nominals, leash)
+        step, hessian = gauss_newton_step(problem, free, undeclared, nominals, leash)
         if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
-            return free, latent, tuple(nominals)
+            return free, undeclared, tuple(nominals)
     for share in STEP_SHARES:
         trial = free + share * step
         values = parameters.to_values(trial)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
-            size, about = with_capacities(problem, latent, now, values), _relinearised(problem, values, nominals)
+            size, about = with_capacities(problem, undeclared, now, values), _relinearised(problem, values, nominals)
             better = posterior(trial, size, about) > before
         if better:
             return trial, size, about
-    return free, latent, tuple(nominals)
+    return free, undeclared, tuple(nominals)
 
 
-def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], LatentHeat]:
+def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], UndeclaredHeat]:
     """Linearise a network that may have more states about the temperatures and heat of a fit close by."""
     network, before = problem.network, near.problem.network
     like = {extra.name: extra.like for extra in network.extra}
@@ -263,5 +265,5 @@ def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[
     for nominal, segment in zip(near.nominals, problem.segments, strict=True):
         states = states_of(nominal)[:, source]
         fresh.append(linearise(problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0)))
-    std = np.where(own, near.latent.std_W[source], 1e-6)
-    return tuple(fresh), LatentHeat(std, near.latent.length_s)
+    std = np.where(own, near.undeclared.std_W[source], 1e-6)
+    return tuple(fresh), UndeclaredHeat(std, near.undeclared.length_s)

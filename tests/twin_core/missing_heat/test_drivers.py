@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twin_core.discover.followed import followed, phases, repeats_with
+from twin_core.missing_heat.drivers import followed, phases, repeats_with
 
 TIMES = 60.0 * np.arange(3000)
 RNG = np.random.default_rng(0)

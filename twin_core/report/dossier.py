@@ -14,9 +14,9 @@ from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import spread_of
-from twin_core.discover.holdout import Prediction
 from twin_core.discover.judge import Search
 from twin_core.flows import flows_along
+from twin_core.holdout import Prediction
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import dump_spec

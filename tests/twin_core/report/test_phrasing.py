@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from twin_core.discover import phrasing
+from twin_core.report import phrasing
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,14 @@ MAX_NODES = 4
 
 
 def nodes_of_interest(search: Search) -> list[str]:
-    """Return the nodes that the findings touch, else the two with most latent heat for their size."""
+    """Return the nodes that the findings touch, else the two with most undeclared heat for their size."""
     nodes: list[str] = []
     for finding in search.findings:
         for effect in finding.effects:
             nodes += touched_nodes(effect, search.base.fit.network.layout)
     if not nodes:
         declared = search.base.fit.problem.network.nodes
-        nodes = [declared[i] for i in np.argsort(-search.base.fit.latent.std_W)[:2]]
+        nodes = [declared[i] for i in np.argsort(-search.base.fit.undeclared.std_W)[:2]]
     return list(dict.fromkeys(nodes))[:MAX_NODES]
 
 
