@@ -184,8 +184,9 @@ def main() -> None:
         "residuals, forecasts and events of all of them back; what the parameter stream takes by itself; the same with one "
         "request per value. Delay: from a sample being sent to Yamcs to its residual being heard from Yamcs, through the "
         "bridge (`--poll 0.1`), the service's commit and its filter; one sample every 0.5 s, which is twenty times as fast as "
-        "its time, so that forecasts are asked for twenty times as often as in operation. With few sensors the first two rates are "
-        "mostly the seconds that a connection takes to begin (checks of every name, reading back), on a machine busy with other work."
+        "its time, so that forecasts are asked for twenty times as often as in operation. With few sensors "
+        "the first two rates are mostly the seconds that a connection takes to begin (checks of every name, reading back), "
+        "on a machine busy with other work."
     )
     print(rates, delays, sep="\n")
     save_table("yamcs_bridge", "Yamcs and a twin", rates + "\n" + delays, "benchmarks.yamcs_bridge", note)
