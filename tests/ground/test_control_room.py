@@ -153,6 +153,8 @@ def look(folder: Path, service: Server, client: Any) -> None:
     """Find the same in Open MCT on the screen."""
     with openmct.served(service.url, folder) as url, Browser(folder / "profile", 1500, 1000) as page:
         page.open(f"{url}/?start=2026-03-01T00:00:00Z&stop=2026-03-02T00:00:00Z")
+        page.until("document.querySelector('.c-tree')")
+        page.evaluate("void openmct.time.setBounds({start: 1772323200000, end: 1772409600000})")
         for name in ("Thermal twins", "demo"):
             page.click(f'[aria-label^="Expand {name} "]')
         page.click('.c-tree [aria-label^="Navigate to T_box "]')

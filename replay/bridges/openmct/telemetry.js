@@ -5,6 +5,7 @@ import { FORECASTS, KIND, parts } from './objects.js';
 const OURS = new Set([KIND.measured, KIND.forecast, KIND.residual, KIND.anomalies]);
 const MOST_STEPS = 500;
 const LEAST_STEP_S = 1;
+const MOST_AHEAD_S = 7 * 86_400;
 const FORECAST_EVERY_MS = 15_000;
 const SHARED_MS = 5_000;
 /** Colours of a twin's limits as levels of Open MCT. */
@@ -92,7 +93,8 @@ export class Telemetry {
 
   async askAhead(twin, end, steps) {
     const detail = await this.api.get(`v1/twins/${twin}`);
-    const horizon = detail?.last_time ? (end - instant(detail.last_time)) / 1000 : 0;
+    const ahead = detail?.last_time ? (end - instant(detail.last_time)) / 1000 : 0;
+    const horizon = Math.min(ahead, MOST_AHEAD_S); // of a recording of the past, the page may show a time years ahead
     if (horizon <= 0 || detail.active_model === null) {
       return null;
     }
