@@ -54,6 +54,10 @@ def test_a_score_by_hand() -> None:
         "pcc": pytest.approx(1.0),
         "bias_K": pytest.approx(-0.5),  # measured - modelled
         "std_K": pytest.approx(0.0),
+        "max_abs_K": pytest.approx(0.5),
+        "q01_K": pytest.approx(-0.5),
+        "q50_K": pytest.approx(-0.5),
+        "q99_K": pytest.approx(-0.5),
         "q99_abs_K": pytest.approx(0.5),
     }
     assert found["per_sensor"]["B"]["bias_K"] == 0.0

@@ -8,7 +8,7 @@ from tests.helpers import at_named, conductive_spec, model_of, record_of
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
-from twin_core.calibrate.undeclared.model import LatentHeat, linearise, smoothed_states
+from twin_core.calibrate.undeclared.model import UndeclaredHeat, linearise, smoothed_states
 from twin_core.effects import REGISTRY, Effect
 from twin_core.forecast import forecast
 from twin_core.network.model import Network, build_network
@@ -129,7 +129,7 @@ def problem_of(drift: float, *effects: Effect) -> Problem:
 
 def test_smoothed_temperatures_are_free_of_the_fitted_fault() -> None:
     """The fault's fitted size counts, not the one that the fit began with."""
-    latent, found = LatentHeat(np.array([5.0]), 600.0), []
+    latent, found = UndeclaredHeat(np.array([5.0]), 600.0), []
     for problem, named in (
         (problem_of(0.0), {}),
         (problem_of(RATE, sensor_drift(0.0)), {"sensor_drift(T0).d_K_per_s": RATE}),
