@@ -89,7 +89,9 @@ def test_the_peak_of_every_orbit_of_a_light_panel_stays() -> None:
     length=st.integers(1, 3),
     sample_s=st.sampled_from([10, 30, 60]),
 )
-@example(seed=0, height_K=25.0, sign=-1.0, length=3, sample_s=10)  # one spike that noise hides made all the others healthy
+@example(
+    seed=0, height_K=25.0, sign=-1.0, length=3, sample_s=10
+)  # one spike that noise hides made all the others healthy
 def test_planted_spikes_are_found_and_nothing_else(
     seed: int, height_K: float, sign: float, length: int, sample_s: int
 ) -> None:
