@@ -173,6 +173,7 @@ def over_http(url: str, count: int, n_twins: int, folder: Path, seconds: float) 
         done = [0] * LANES
 
         def send(lane: int) -> None:
+            """Post to every LANES-th twin in turn, to one service after another, until the time is up."""
             with httpx.Client(timeout=30, trust_env=False) as client:
                 own = list(range(lane, n_twins, LANES))
                 turn = 0

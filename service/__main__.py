@@ -2,7 +2,7 @@
 
 import sys
 
-from service.logs import start_logging
+from service.monitoring.logs import start_logging
 from service.server import serve
 from service.settings import read_settings
 from twin_core.errors import TwinError

@@ -1,43 +1,27 @@
 """The application: layers, routes and what lives as long as it runs."""
 
 import contextlib
-import logging
 from collections.abc import AsyncIterator
 from functools import partial
 from typing import Any
 
 from fastapi import Depends, FastAPI
 
-from service.core_workbench import CoreWorkbench
-from service.dispatch import Dispatch
-from service.fleet.member import Member, join
-from service.fleet.ownership import Alone
-from service.housekeeping import Housekeeping
 from service.http import problems
 from service.http.audit import Audit
 from service.http.auth import Gate
 from service.http.body_limit import Bodies
-from service.http.deps import Service, known_parameters
+from service.http.deps import known_parameters
 from service.http.head import Heads
 from service.http.observe import Observe
 from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, rows, streams, telemetry, twins
 from service.http.shortcut import Shortcut
-from service.intake import Intake
-from service.jobs.executor import ProcessPerTask, Tasks
-from service.jobs.runner import Jobs
-from service.jobs.schedule import Schedule
-from service.live.live import Live
-from service.live.silence import Silence
-from service.metrics import Metrics
-from service.registry import Registry
+from service.monitoring.metrics import Metrics
+from service.running.start import running
 from service.settings import Settings, read_settings
-from service.store import jobs as job_table
-from service.store import twins as twin_table
 from service.store.database import Database
-from service.streams import Hub
-from service.workbench import MakeWorkbench
-
-log = logging.getLogger("service")
+from service.workbench.core import CoreWorkbench
+from service.workbench.interface import MakeWorkbench
 
 ROUTERS = (
     telemetry.router,
@@ -53,81 +37,6 @@ ROUTERS = (
     admin.audit,
     admin.webhooks,
 )
-
-
-@contextlib.asynccontextmanager
-async def running(
-    settings: Settings, database: Database, metrics: Metrics, workbench: MakeWorkbench
-) -> AsyncIterator[Service]:
-    """Start everything that works in the background, and stop it in the opposite order."""
-    leases, bus = join(database, settings)
-    owners = leases or Alone()
-    if not database.is_shared:
-        interrupted = await database.write(job_table.fail_interrupted)
-        if interrupted:
-            log.warning("jobs were interrupted when the service stopped", extra={"jobs": interrupted})
-    hub = Hub(database, metrics, settings.stream_buffer, None if bus is None else bus.hint)
-    live_state = Live(
-        database,
-        hub,
-        metrics,
-        workbench,
-        settings.false_alarm_rate,
-        settings.limit_horizon_s,
-        settings.assimilate_samples,
-        owners,
-    )
-    executor = _executor(settings)
-    rooms = (database, hub, metrics, workbench, executor)
-    runner = Jobs(
-        *rooms,
-        settings.job_workers,
-        settings.job_values,
-        live_state.model_changed,
-        lambda twin: service.find_key(twin),
-    )
-    intake = Intake(hub, live_state, metrics, settings.clock_tolerance_s)
-    housekeeping = Housekeeping(database, owners)
-    service = Service(settings, database, Registry(()), metrics, hub, live_state, intake, runner, housekeeping, owners)
-    for twin in await database.read(twin_table.select):
-        service.add_twin(twin)
-    dispatch = Dispatch(database, owners)
-    silence = Silence(service.registry, live_state, hub, owners)
-    schedule = Schedule(
-        database,
-        service.registry,
-        runner,
-        settings.calibrate_every_s,
-        settings.anomaly_patience_s,
-        settings.refutation_rate,
-        live_state.evidence,
-        owners,
-    )
-    member = None if leases is None or bus is None else Member(service, bus, leases)
-    if member is not None:
-        await member.joined()
-    try:
-        yield service
-    finally:
-        hub.close()
-        if member is not None:
-            await member.close()
-        await silence.close()
-        await schedule.close()
-        await dispatch.close()
-        await housekeeping.close()
-        await runner.close()
-        await live_state.close()
-
-
-def _executor(settings: Settings) -> Tasks:
-    """Return what computes jobs."""
-    workers = max(settings.job_workers, 1)
-    if settings.executor == "process":
-        return ProcessPerTask(workers, settings.job_deadline_s, settings.job_memory_mib)
-    from service.jobs.dask import DaskTasks
-
-    return DaskTasks(settings.executor.replace("dask://", "tcp://"), workers, settings.job_deadline_s)
 
 
 def _describe_access(app: FastAPI) -> None:

@@ -26,6 +26,14 @@ class Refusal(Exception):
         self.detail, self.errors = detail, errors
 
 
+class TooLittle(Refusal):
+    """What is asked for needs more telemetry than there is."""
+
+
+class TooMuch(Refusal):
+    """So much of it waits already that no more is taken now."""
+
+
 class BadField(Refusal):
     """One field of a request is wrong."""
 

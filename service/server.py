@@ -16,7 +16,7 @@ from service.app import create_app
 from service.http.protocol import patient
 from service.settings import Settings, unknown_variables
 from service.store.database import Database
-from service.workbench import MakeWorkbench
+from service.workbench.interface import MakeWorkbench
 from twin_core.errors import TwinError
 
 log = logging.getLogger("service")

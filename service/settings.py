@@ -1,5 +1,6 @@
 """Settings: read once from ``TWIN_*`` environment variables into one frozen record."""
 
+import ipaddress
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,8 +9,7 @@ from typing import Any
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.http.auth import is_loopback
-from service.http.keys import Key, Keys, parse_keys
+from service.keys import Key, Keys, parse_keys
 from twin_core.errors import TwinError
 
 MIB = 1024 * 1024
@@ -18,6 +18,16 @@ POSTGRES = "postgresql://"
 
 class SettingsError(TwinError):
     """A setting is wrong, or the settings together would be unsafe."""
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address can only be reached from this machine."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 class Settings(BaseSettings):

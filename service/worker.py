@@ -5,12 +5,12 @@ import signal
 from collections.abc import Callable
 from functools import partial
 
-from service.app import running
-from service.core_workbench import CoreWorkbench
-from service.metrics import Metrics
+from service.monitoring.metrics import Metrics
+from service.running.start import running
 from service.settings import Settings, SettingsError
 from service.store.database import Database
-from service.workbench import MakeWorkbench
+from service.workbench.core import CoreWorkbench
+from service.workbench.interface import MakeWorkbench
 
 
 def work(

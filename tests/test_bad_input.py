@@ -372,7 +372,7 @@ def desk(
     return tmp_path
 
 
-def refuse(argv: Sequence[str], desk: Path, capsys: pytest.CaptureFixture[str], *expected: str) -> None:
+def assert_refused(argv: Sequence[str], desk: Path, capsys: pytest.CaptureFixture[str], *expected: str) -> None:
     """Assert that the command line refuses its input as it must."""
     before = sorted(path.name for path in desk.iterdir())
     code = main(argv)
@@ -394,7 +394,7 @@ def test_specification(
     change(pair)
     (desk / "spec.yaml").write_text(yaml.safe_dump(pair))
     argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
-    refuse(argv, desk, capsys, expected)
+    assert_refused(argv, desk, capsys, expected)
 
 
 def test_a_shared_unknown_has_one_unit(desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -405,7 +405,7 @@ def test_a_shared_unknown_has_one_unit(desk: Path, pair: dict[str, Any], capsys:
     (desk / "spec.yaml").write_text(yaml.safe_dump(pair))
     argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
     wrong = "conductors[0].conductance_W_per_K.per_area: 'x' is in J/kg/K elsewhere and would be in W/m2/K here"
-    refuse(argv, desk, capsys, f"spec.yaml: {wrong}", "; also: parameters.y: give a 'guess' that is calibrated")
+    assert_refused(argv, desk, capsys, f"spec.yaml: {wrong}", "; also: parameters.y: give a 'guess' that is calibrated")
 
 
 def test_everything_that_is_wrong_is_told_at_once(
@@ -426,7 +426,7 @@ def test_everything_that_is_wrong_is_told_at_once(
         for change, _ in changes:
             change(wrong)
         (desk / "spec.yaml").write_text(yaml.safe_dump(wrong))
-        refuse(argv, desk, capsys, *(text for _, text in changes))
+        assert_refused(argv, desk, capsys, *(text for _, text in changes))
         with pytest.raises(SpecError) as caught:
             load_spec(wrong)
         assert str(caught.value) == caught.value.problems[0]
@@ -438,14 +438,16 @@ def test_specification_file(
     name: str, text: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (desk / name).write_text(text)
-    refuse(["close-loop", "--spec", name, "--telemetry", "data.csv", "--out", "loop"], desk, capsys, name, expected)
+    assert_refused(
+        ["close-loop", "--spec", name, "--telemetry", "data.csv", "--out", "loop"], desk, capsys, name, expected
+    )
 
 
 @pytest.mark.parametrize(("content", "expected"), TELEMETRY, ids=[case[1] for case in TELEMETRY])
 def test_telemetry(content: str | bytes, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (desk / "data.csv").write_bytes(content if isinstance(content, bytes) else content.encode())
     argv = ["calibrate", "--spec", "spec.yaml", "--telemetry", "data.csv", "--out", "model.json"]
-    refuse(argv, desk, capsys, "data.csv", expected)
+    assert_refused(argv, desk, capsys, "data.csv", expected)
 
 
 def test_orbit_without_dates(desk: Path, pair: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -455,12 +457,14 @@ def test_orbit_without_dates(desk: Path, pair: dict[str, Any], capsys: pytest.Ca
     for command in ("calibrate --out model.json", "close-loop --out loop"):
         name, *rest = command.split()
         argv = [name, "--spec", "spec.yaml", "--telemetry", "data.csv", *rest]
-        refuse(argv, desk, capsys, "data.csv: the orbit needs dates; give a 'time' column in RFC 3339, not 'time_s'")
+        assert_refused(
+            argv, desk, capsys, "data.csv: the orbit needs dates; give a 'time' column in RFC 3339, not 'time_s'"
+        )
 
 
 @pytest.mark.parametrize(("line", "expected"), ARGUMENTS, ids=[case[1] for case in ARGUMENTS])
 def test_arguments(line: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    refuse(line.split(), desk, capsys, expected)
+    assert_refused(line.split(), desk, capsys, expected)
 
 
 @pytest.mark.parametrize(("change", "expected"), MODELS, ids=[case[1] for case in MODELS])
@@ -469,14 +473,14 @@ def test_model_file(change: Edit, expected: str, desk: Path, capsys: pytest.Capt
     change(model)
     (desk / "model.json").write_text(json.dumps(model))
     line = "forecast --model model.json --telemetry data.csv --horizon 600 --out x.csv"
-    refuse(line.split(), desk, capsys, "model.json: ", expected)
+    assert_refused(line.split(), desk, capsys, "model.json: ", expected)
 
 
 @pytest.mark.parametrize(("text", "expected"), PLANS, ids=[case[1] for case in PLANS])
 def test_plan(text: str, expected: str, desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (desk / "plan.csv").write_text(text)
     line = "forecast --model model.json --telemetry data.csv --horizon 600 --plan plan.csv --out x.json"
-    refuse(line.split(), desk, capsys, expected)
+    assert_refused(line.split(), desk, capsys, expected)
 
 
 @pytest.mark.parametrize(

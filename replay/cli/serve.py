@@ -14,7 +14,7 @@ from replay.cli.command import Command
 def serve(host: str | None, port: int | None, effects: tuple[str, ...]) -> None:
     """Run the service and its dashboard until interrupted; TWIN_* environment variables hold its settings."""
     from replay.cli.console import print_line
-    from service.logs import start_logging
+    from service.monitoring.logs import start_logging
     from service.server import serve as run
     from service.settings import read_settings
 

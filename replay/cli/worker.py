@@ -13,7 +13,7 @@ def worker(jobs: int | None) -> None:
     Any number of workers on any machines may share a database; a job whose worker dies is done by another one.
     """
     from replay.cli.console import print_line
-    from service.logs import start_logging
+    from service.monitoring.logs import start_logging
     from service.settings import read_settings
     from service.worker import work
 

@@ -1,13 +1,13 @@
 """Who may do what: the gate in front of every route."""
 
-import ipaddress
 from functools import lru_cache
 from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.http.keys import Key, Keys, Role
 from service.http.problems import problem
+from service.keys import Key, Keys, Role
+from service.settings import is_loopback
 
 OPEN_PATHS = frozenset({"/", "/healthz", "/readyz", "/docs", "/openapi.json", "/favicon.ico"})
 OPEN_PREFIXES = ("/assets/", "/docs/")
@@ -76,16 +76,6 @@ _HEADERS = frozenset({b"authorization", b"sec-websocket-protocol", b"origin", b"
 
 def _netloc(origin: bytes) -> str:
     return urlsplit(origin.decode("latin-1")).netloc
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether an address can only be reached from this machine."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 @lru_cache(maxsize=64)

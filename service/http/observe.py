@@ -6,7 +6,7 @@ from http import HTTPMethod
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.metrics import Metrics
+from service.monitoring.metrics import Metrics
 
 METHODS = frozenset(HTTPMethod)
 """Counted by name; whatever else a caller makes up is not, since each name is kept for ever."""

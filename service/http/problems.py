@@ -14,7 +14,8 @@ from starlette.responses import Response
 from starlette.routing import Match, Mount
 from starlette.types import Receive, Scope, Send
 
-from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, Refusal, short
+from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, Refusal, TooLittle, TooMuch, short
+from service.live.engine import WorkerDied
 from service.store.errors import Conflicting, DiskFull, Missing, TwinGone, Unavailable
 from twin_core.errors import TwinError
 
@@ -36,7 +37,16 @@ class Problem(Refusal):
         self.status = status
 
 
-STATUS: Mapping[type[Refusal], int] = {BadField: 422, Missing: 404, Conflicting: 409, DiskFull: 507, Unavailable: 503}
+STATUS: Mapping[type[Refusal], int] = {
+    BadField: 422,
+    TooLittle: 422,
+    TooMuch: 429,
+    Missing: 404,
+    Conflicting: 409,
+    DiskFull: 507,
+    Unavailable: 503,
+    WorkerDied: 503,
+}
 """What each refusal is in HTTP."""
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from service.instants import now_us, parse_instant
-from service.messages import EventStretch, Stretch
 from service.store import anomalies, events, jobs, models
 from service.store.connection import Connection
-from service.workbench import Outcome
+from service.stream.messages import EventStretch, Stretch
+from service.workbench.interface import Outcome
 from twin_core.anomaly.detect import TOGETHER
 
 Json = dict[str, Any]

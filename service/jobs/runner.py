@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import Refusal
-from service.http.problems import Problem
+from service.errors import Refusal, TooLittle, TooMuch
 from service.instants import parse_instant
 from service.jobs import outcome
 from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Tasks
 from service.jobs.outcome import Finished
-from service.metrics import Metrics
-from service.registry import Entry
+from service.monitoring.metrics import Metrics
 from service.store import jobs, models, selection
 from service.store.database import Database
 from service.store.errors import LeaseLost
@@ -28,8 +26,9 @@ from service.store.jobs import Claim, JobRow
 from service.store.models import Active
 from service.store.samples import Samples
 from service.store.selection import Selection
-from service.streams import Hub
-from service.workbench import CalibrationTask, DiagnosisTask, MakeWorkbench, Telemetry, work
+from service.stream.hub import Hub
+from service.twins.registry import Entry
+from service.workbench.interface import CalibrationTask, DiagnosisTask, MakeWorkbench, Telemetry, work
 from twin_core import __version__
 from twin_core.telemetry import GAP_STEPS
 
@@ -94,9 +93,9 @@ class Jobs:
         self._tasks.append(asyncio.create_task(self._beat_forever()))
 
     async def start(self, twin: Entry, kind: str, request: Json) -> JobRow:
-        """Queue a job and return it; Problem 429 if too many wait already."""
+        """Queue a job and return it; TooMuch if too many wait already."""
         if await self._database.read(jobs.waiting, twin.key) >= MOST_WAITING:
-            raise Problem(429, f"{MOST_WAITING} jobs of '{twin.name}' have not ended yet; wait for them or cancel some")
+            raise TooMuch(f"{MOST_WAITING} jobs of '{twin.name}' have not ended yet; wait for them or cancel some")
         job = uuid.uuid4().hex[:12]
         row = await self._database.write_to(twin.key, jobs.create, twin.key, job, kind, request)
         self._wake.set()
@@ -270,7 +269,7 @@ class Jobs:
         return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival), "calibrate"
 
     async def choose(self, twin: Entry, request: Json) -> Selection:
-        """Return the part of the archive that a request names; Problem 422 if it holds too little."""
+        """Return the part of the archive that a request names; TooLittle if it holds too little."""
         start_us, stop_us = (
             None if (at := request.get(n)) is None else parse_instant(at, n) for n in ("start", "stop")
         )
@@ -286,7 +285,7 @@ class Jobs:
         chosen = await self._database.read(selection.choose, twin.key, n, *how)
         if chosen.samples.time_us.size < LEAST_SAMPLES:
             held = chosen.samples.time_us.size
-            raise Problem(422, f"the archive holds {held} samples there, {LEAST_SAMPLES} are needed")
+            raise TooLittle(f"the archive holds {held} samples there, {LEAST_SAMPLES} are needed")
         return chosen
 
     def _reporter(self, held: Claim) -> Callable[[float, str], None]:

@@ -12,10 +12,10 @@ from service.errors import Refusal
 from service.fleet.ownership import Ownership
 from service.instants import now_us
 from service.jobs.runner import LEAST_SAMPLES, Jobs
-from service.registry import Entry, Registry
 from service.schemas import CalibrationRequest, DiagnosisRequest
 from service.store import anomalies, audit, jobs, twins
 from service.store.database import Database
+from service.twins.registry import Entry, Registry
 from twin_core.anomaly import adjusted, discoveries
 
 log = logging.getLogger("service.jobs")

@@ -8,9 +8,18 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
-from service.http.problems import Problem
+from service.errors import Refusal
 from service.jobs.executor import prepare_worker
-from service.workbench import Filtered, Forecasted, ForecastTask, Json, MakeWorkbench, Masks, Outcome, Telemetry
+from service.workbench.interface import (
+    Filtered,
+    Forecasted,
+    ForecastTask,
+    Json,
+    MakeWorkbench,
+    Masks,
+    Outcome,
+    Telemetry,
+)
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -19,7 +28,7 @@ WORKERS = 2
 log = logging.getLogger("service.live")
 
 
-class WorkerDied(Problem):
+class WorkerDied(Refusal):
     """A worker process dies over this question, even where it has one to itself."""
 
 
@@ -76,7 +85,7 @@ class Engine:
         try:
             return await asyncio.wrap_future(alone.submit(function, *args, **kwargs))
         except BrokenProcessPool:
-            raise WorkerDied(503, "the worker process died twice over this request; try again or recalibrate") from None
+            raise WorkerDied("the worker process died twice over this request; try again or recalibrate") from None
         finally:
             alone.shutdown(wait=False)
 

@@ -9,13 +9,13 @@ from service.live import screening
 from service.live.engine import Engine
 from service.live.position import RECENT, Position, stretch
 from service.live.progress import Step
-from service.registry import Entry
 from service.store import samples
 from service.store.anomalies import Change
 from service.store.database import Database
 from service.store.models import Active
 from service.store.samples import Samples
-from service.workbench import Filtered, Telemetry
+from service.twins.registry import Entry
+from service.workbench.interface import Filtered, Telemetry
 from twin_core.anomaly import Thresholds, detect
 
 

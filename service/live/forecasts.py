@@ -6,19 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import BadField, short
-from service.http.problems import Problem
+from service.errors import BadField, Refusal, short
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
 from service.live.known import Known
 from service.live.position import Position
 from service.live.pulse import Beat
-from service.registry import Entry
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
 from service.store.database import Database
 from service.store.models import Active
-from service.workbench import Forecasted, ForecastTask, Telemetry
+from service.twins.registry import Entry
+from service.workbench.interface import Forecasted, ForecastTask, Telemetry
 
 SETTLE_S = 10.0
 """How long a forecast waits for samples that are stored but not yet assimilated."""
@@ -34,13 +33,13 @@ Json = dict[str, Any]
 
 
 async def state_of(tracker: Known) -> tuple[Active, Position]:
-    """Return the active model and its present state; Problem 409 if there is none."""
+    """Return the active model and its present state; Refusal if there is none."""
     settled = await tracker.settled(SETTLE_S)
     if tracker.active is None:
-        raise Problem(409, "no model is active; calibrate first, or activate a version")
+        raise Refusal("no model is active; calibrate first, or activate a version")
     if tracker.position is None:
         reason = tracker.trouble or ("the archive is empty" if settled else "the archive is still being assimilated")
-        raise Problem(409, f"the state is not known: {reason}")
+        raise Refusal(f"the state is not known: {reason}")
     return tracker.active, tracker.position
 
 
@@ -151,7 +150,7 @@ class Look:
 
 
 async def look_ahead(tracker: Known, database: Database, engine: Engine, request: ForecastRequest) -> Look:
-    """Forecast from the present state; Problem if there is none, or if the request asks for too much."""
+    """Forecast from the present state; Refusal if there is none, or if the request asks for too much."""
     active, position = await state_of(tracker)
     lag = await behind(tracker, database)
     past = await past_of(tracker.twin, database, active, position)

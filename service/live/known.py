@@ -5,11 +5,11 @@ from typing import Protocol
 
 from service.live.position import Position
 from service.live.scout import Base
-from service.registry import Entry
 from service.store import checkpoints, models, samples, twins
 from service.store.connection import Connection
 from service.store.database import Database
 from service.store.models import Active
+from service.twins.registry import Entry
 
 PATIENCE_S = 2.0
 """A state that another process works on is waited for no longer: what cannot be assimilated never comes."""

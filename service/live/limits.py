@@ -13,8 +13,6 @@ from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
 from service.live.tracker import Tracker
-from service.messages import EventStretch, Stretch
-from service.registry import Entry
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
 from service.store.alarms import AlarmRow, Limit
@@ -22,8 +20,10 @@ from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import LeaseLost, TwinGone
 from service.store.samples import Samples
-from service.streams import Hub
-from service.workbench import Forecasted
+from service.stream.hub import Hub
+from service.stream.messages import EventStretch, Stretch
+from service.twins.registry import Entry
+from service.workbench.interface import Forecasted
 from twin_core.anomaly.limits import LEAST_BAND, NOISES, Ahead, reaches, watch
 from twin_core.errors import TwinError
 from twin_core.quality.sentinels import marked

@@ -2,8 +2,8 @@
 
 import copy
 
+from service.errors import Refusal
 from service.fleet.ownership import Ownership
-from service.http.problems import Problem
 from service.live import pulse as pulses
 from service.live.engine import Engine
 from service.live.known import Known, Stored
@@ -11,11 +11,11 @@ from service.live.limits import LimitWatch
 from service.live.pulse import Beat, Pulse
 from service.live.scores import Scores
 from service.live.tracker import Tracker
-from service.metrics import Metrics
-from service.registry import Entry
+from service.monitoring.metrics import Metrics
 from service.store.database import Database
-from service.streams import Hub
-from service.workbench import Json, MakeWorkbench, Outcome
+from service.stream.hub import Hub
+from service.twins.registry import Entry
+from service.workbench.interface import Json, MakeWorkbench, Outcome
 from twin_core.anomaly import Thresholds
 
 
@@ -68,7 +68,7 @@ class Live:
             await tracker.close()
 
     def state(self, twin: Entry) -> Known:
-        """Return what is known of the state of a twin; Problem 409 if nothing follows its samples.
+        """Return what is known of the state of a twin; Refusal if nothing follows its samples.
 
         Where another process follows them, that is what it has written down.
         """
@@ -76,9 +76,7 @@ class Live:
         if tracker is None and self._follows_elsewhere and not self._ownership.owns(twin.key):
             return Stored(twin, self._database)
         if tracker is None:
-            raise Problem(
-                409, f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted"
-            )
+            raise Refusal(f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted")
         return tracker
 
     async def beats(self, twin: Entry) -> dict[str, Beat]:

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.registry import Entry
 from service.store.checkpoints import Checkpoint
 from service.store.samples import Samples
-from service.workbench import Telemetry
+from service.twins.registry import Entry
+from service.workbench.interface import Telemetry
 
 Json = dict[str, Any]
 _KEPT = ("seq", "state", "held", "detector", "recent_us")

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.instants import now_us
-from service.messages import EventStretch, ResidualStretch, Stretch
-from service.registry import Entry
 from service.store import anomalies, checkpoints, events, residuals, samples
 from service.store.anomalies import AnomalyRow, Change
 from service.store.checkpoints import Checkpoint
 from service.store.connection import Connection
 from service.store.residuals import Residuals
 from service.store.samples import Samples
+from service.stream.messages import EventStretch, ResidualStretch, Stretch
+from service.twins.registry import Entry
 
 BLOCK = 5000
 """At most so many samples are assimilated in one step."""

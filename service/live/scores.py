@@ -11,10 +11,10 @@ import orjson
 from service.errors import Refusal
 from service.instants import format_instant
 from service.live.engine import Engine
-from service.registry import Entry
 from service.store import models, samples, twins
 from service.store.database import Database
-from service.workbench import Json, Telemetry
+from service.twins.registry import Entry
+from service.workbench.interface import Json, Telemetry
 
 log = logging.getLogger("service.live")
 

@@ -14,13 +14,13 @@ from service.live.caution import Caution
 from service.live.following import Following
 from service.live.position import Position, is_far, next_count
 from service.live.progress import ahead, save
-from service.registry import Entry
 from service.store import samples
 from service.store.database import Database
 from service.store.models import Active
 from service.store.samples import Samples
-from service.streams import Hub
-from service.workbench import Telemetry
+from service.stream.hub import Hub
+from service.twins.registry import Entry
+from service.workbench.interface import Telemetry
 from twin_core.errors import TwinError
 
 log = logging.getLogger("service.live")

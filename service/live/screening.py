@@ -8,9 +8,9 @@ import numpy as np
 
 from service.instants import format_instant
 from service.live.engine import Engine
-from service.registry import Entry
 from service.store.samples import Samples
-from service.workbench import Masks, Telemetry
+from service.twins.registry import Entry
+from service.workbench.interface import Masks, Telemetry
 from twin_core.quality.runs import runs_of
 from twin_core.quality.screen import SENTINEL
 

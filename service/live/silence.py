@@ -9,9 +9,9 @@ from service.fleet.ownership import Alone, Ownership
 from service.instants import in_words, now_us
 from service.jobs import outcome
 from service.live.live import Live
-from service.registry import Entry, Registry
 from service.store.errors import LeaseLost, TwinGone
-from service.streams import Hub
+from service.stream.hub import Hub
+from service.twins.registry import Entry, Registry
 
 log = logging.getLogger("service.live")
 

@@ -14,14 +14,14 @@ from service.live.following import Followed, Following
 from service.live.position import Position, is_far, next_count
 from service.live.progress import Outdated, Reading
 from service.live.scout import Base, Scout
-from service.metrics import Metrics
-from service.registry import Entry
+from service.monitoring.metrics import Metrics
 from service.store import models
 from service.store.database import Database
 from service.store.errors import LeaseLost, TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
-from service.streams import Hub
+from service.stream.hub import Hub
+from service.twins.registry import Entry
 from twin_core.anomaly import Thresholds
 from twin_core.errors import TwinError
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from service.metrics import Metrics
+from service.monitoring.metrics import Metrics
 from tests.ground.openmct import NODE
 
 ROOT = Path(__file__).parents[2]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.workbench import (
+from service.workbench.interface import (
     CalibrationTask,
     DiagnosisTask,
     Filtered,

@@ -3,7 +3,7 @@
 import httpx
 import pytest
 
-from service.http.keys import Role, parse_keys
+from service.keys import Role, parse_keys
 from service.settings import SettingsError, read_settings
 from tests.service.harness import AppClient
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.workbench import Forecasted, ForecastTask
+from service.workbench.interface import Forecasted, ForecastTask
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.downsample import extremes
+from service.archive.downsample import extremes
 
 
 @pytest.mark.parametrize("n_channels", [1, 3, 12])

@@ -6,7 +6,7 @@ import httpx
 import orjson
 import pytest
 
-from service import intake
+from service.archive import intake
 from service.http import telemetry_body
 from service.store.database import Database
 from tests.service.harness import AppClient

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from replay.cli.main import main
-from service import dispatch
 from service.errors import Refusal
 from service.live.silence import Silence
-from service.logs import JsonLines
+from service.monitoring.logs import JsonLines
+from service.running import dispatch
 from service.settings import SettingsError, read_settings
 from service.store.sqlite import migrations
 from tests.service.conftest import SPEC
@@ -48,7 +48,7 @@ def key_file(tmp_path: Path) -> Path:
 def test_keys_have_names_expire_and_change_without_a_restart(
     make_client: Any, key_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.http.keys.LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr("service.keys.LOOK_EVERY_S", 0.0)
     client = make_client(api_keys_file=key_file, api_keys="read:r-key")
     assert [ask(client, key).status_code for key in ("anna-secret", "ben-secret", "r-key")] == [200, 200, 200]
     assert [ask(client, key).status_code for key in ("old-secret", "sha256:", "")] == [401, 401, 401]

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.store import stream
-from service.workbench import Filtered, Json, Telemetry
+from service.stream import past
+from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
 from tests.service.harness import AppClient
@@ -273,7 +273,7 @@ def messages(client: AppClient) -> list[dict]:
     service = client.app.state.service
     twin = service.registry.get("benchsat")
     read = service.database.read
-    arguments = (stream.since_seq, twin.key, twin.channels, twin.sensors, 0, 10_000)
+    arguments = (past.since_seq, twin.key, twin.channels, twin.sensors, 0, 10_000)
     return client.portal.call(lambda: read(*arguments))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.workbench import Filtered, Json, Telemetry
+from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient

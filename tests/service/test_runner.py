@@ -3,7 +3,7 @@
 import numpy as np
 
 from service.jobs.runner import validation_start
-from service.workbench import Telemetry
+from service.workbench.interface import Telemetry
 
 
 def archive(time_s: np.ndarray) -> Telemetry:

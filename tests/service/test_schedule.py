@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from service.jobs.schedule import LONGEST_BACK_OFF_S, Watch
-from service.workbench import Filtered, Json, Telemetry
+from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from service.core_workbench import CoreWorkbench
-from service.workbench import Masks, Telemetry
+from service.workbench.core import CoreWorkbench
+from service.workbench.interface import Masks, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient

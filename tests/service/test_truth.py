@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.workbench import DiagnosisTask, Outcome, Progress
+from service.workbench.interface import DiagnosisTask, Outcome, Progress
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from service.registry import Entry
 from service.store.errors import TwinGone
+from service.twins.registry import Entry
 from tests.service.conftest import SPEC
 from tests.service.harness import AppClient
 

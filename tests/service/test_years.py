@@ -139,7 +139,7 @@ def test_a_new_model_follows_a_window_of_the_archive(make_client: Any) -> None:
 
 def test_answers_are_bounded_and_exports_are_whole(make_client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.http.routes.telemetry.USUAL_VALUES", 900)
-    monkeypatch.setattr("service.export.PIECE", 700)
+    monkeypatch.setattr("service.archive.export.PIECE", 700)
     client = make_client()
     client.post("/v1/twins", json=SPEC)
     for first in range(0, N, 500):

@@ -3,7 +3,7 @@
 from fastapi import APIRouter, Response
 
 from service.http.deps import Running, reads
-from service.metrics import CONTENT_TYPE
+from service.monitoring.metrics import CONTENT_TYPE
 from service.store import twins, watch
 
 router = APIRouter(tags=["health"])

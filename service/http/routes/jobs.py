@@ -12,9 +12,9 @@ from service.http.deps import NamedTwin, Running, Service, operates, reads
 from service.http.problems import Problem
 from service.instants import format_instant, parse_instant
 from service.jobs.runner import LEAST_SAMPLES
-from service.registry import Entry
 from service.schemas import CalibrationRequest, DiagnosisRequest, Job, JobKind, JobList
 from service.store import jobs, twins
+from service.twins.registry import Entry
 
 PAGE_POLICY = "default-src 'none'; img-src data:; font-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 

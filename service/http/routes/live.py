@@ -8,16 +8,16 @@ import orjson
 from fastapi import APIRouter, Query, Response
 from numpy.typing import NDArray
 
-from service.downsample import extremes
-from service.fit import lacks
+from service.archive.downsample import extremes
 from service.http.deps import NamedTwin, Running, Service, reads
 from service.http.routes.telemetry import Points, bounded, span
 from service.instants import format_instant, format_instants
 from service.live import forecasts, limits, screening
-from service.registry import Entry
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Inputs, Network, Residuals
 from service.store import anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
+from service.twins.fit import lacks
+from service.twins.registry import Entry
 
 router = APIRouter(prefix="/v1/twins/{twin}", tags=["live state"])
 

@@ -4,11 +4,11 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Path
 
-from service.fit import refuse_foreign
 from service.http.deps import NamedTwin, Running, operates, reads
 from service.jobs import outcome
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
 from service.store import models, retention
+from service.twins.fit import refuse_foreign
 from twin_core import __version__
 from twin_core.network.spec_io import load_spec
 

@@ -12,9 +12,9 @@ from starlette.responses import StreamingResponse
 from service.errors import BadField
 from service.http.auth import SUBPROTOCOL
 from service.http.deps import NamedTwin, Running, reads
-from service.messages import Json
-from service.registry import Entry
-from service.streams import Hub
+from service.stream.hub import Hub
+from service.stream.messages import Json
+from service.twins.registry import Entry
 
 router = APIRouter(prefix="/v1/twins/{twin}", tags=["streams"])
 

@@ -10,19 +10,19 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.responses import StreamingResponse
 from starlette.routing import Route
 
-from service import archive_changes, export
-from service.downsample import extremes
+from service.archive import changes, export
+from service.archive.downsample import extremes
 from service.errors import BadField, short
 from service.http.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
-from service.http.keys import Role
 from service.http.problems import Problem
 from service.http.telemetry_body import parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_instant, parse_parameter
-from service.registry import Entry
+from service.keys import Role
 from service.schemas import Archive, Deletion, DeletionList, IngestReport, Interval, Posted, Quarantine
 from service.store import aside, samples
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Receipt, Samples
+from service.twins.registry import Entry
 
 PREFIX = "/v1/twins/{twin}/telemetry"
 router = APIRouter(prefix=PREFIX, tags=["telemetry"])
@@ -148,7 +148,7 @@ async def delete(
     if start is None and stop is None and channels is None:
         raise Problem(422, "name at least one of start, stop and channels; to delete everything, delete the twin")
     names = None if channels is None else named(channels, twin)
-    made = await service.hub.write(twin.key, archive_changes.delete, twin, *span(start, stop), names)
+    made = await service.hub.write(twin.key, changes.delete, twin, *span(start, stop), names)
     if made.samples:
         service.live.archive_changed(twin)
     log.warning("telemetry was deleted", extra={"twin": twin.name, **made.wire()})
@@ -167,7 +167,7 @@ async def undo(
     service: Running, twin: NamedTwin, deletion: Annotated[int, Path(ge=1, le=2**62, description="Its number.")]
 ) -> Deletion:
     """Put back what a deletion took, unless it is more than a day old; what was stored there meanwhile stays as it is."""
-    made = await service.hub.write(twin.key, archive_changes.undo, twin, deletion)
+    made = await service.hub.write(twin.key, changes.undo, twin, deletion)
     service.live.arrived(twin)
     log.warning("a deletion was undone", extra={"twin": twin.name, **made.wire()})
     return Deletion(**made.wire())
@@ -193,7 +193,7 @@ async def release(service: Running, twin: NamedTwin, request: Interval | None = 
     """Let samples out of quarantine into the archive, where they move the present: their clock was right."""
     asked = request or Interval()
     start_us, stop_us = (None if t is None else parse_instant(t, n) for n, t in asked)
-    receipt = await service.hub.write(twin.key, archive_changes.release, twin, start_us, stop_us)
+    receipt = await service.hub.write(twin.key, changes.release, twin, start_us, stop_us)
     service.live.arrived(twin)
     log.warning("samples were let out of quarantine", extra={"twin": twin.name, "n": int(receipt.status.size)})
     return IngestReport(**_report(receipt))

@@ -6,12 +6,10 @@ from typing import Any, Literal
 from fastapi import APIRouter, Request, Response
 
 from service.errors import BadField
-from service.fit import lacks
 from service.http.deps import NamedTwin, Running, Service, operates, reads
 from service.http.specification_body import BODY, read_specification
 from service.instants import format_instant, now_us
 from service.live import forecasts
-from service.registry import Entry
 from service.schemas import (
     Assimilation,
     ChannelState,
@@ -29,6 +27,8 @@ from service.store import anomalies, models, retention, twins, watch
 from service.store.connection import Connection
 from service.store.errors import Missing, TwinGone
 from service.store.twins import Twin
+from service.twins.fit import lacks
+from service.twins.registry import Entry
 
 OF_READINGS = ("stuck", "quantised", "dropout")
 """Anomalies that the readings themselves show, whatever the model says."""
@@ -96,7 +96,7 @@ async def _telemetry(service: Service, twin: Entry, version: int | None) -> dict
 async def register(service: Running, response: Response, request: Request) -> TwinDetail:
     """Register a specification, JSON or YAML (201); the identical one again answers 200, another one under its id 409."""
     given = await read_specification(request)
-    twin, is_new = await service.register(given)
+    twin, is_new = await service.register(given.spec, given.data)
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
     return await _detail(service, twin)
@@ -146,7 +146,7 @@ async def revise(service: Running, twin: NamedTwin, request: Request) -> Revised
     given = await read_specification(request)
     if given.spec.twin != twin.name:
         raise BadField("twin", f"is '{given.spec.twin}', the path names '{twin.name}'")
-    made, _ = await service.revise(twin, given)
+    made, _ = await service.revise(twin, given.spec, given.data)
     detail = await _detail(service, made)
     standing = await service.database.read(_standing, made)
     return RevisedTwin(**detail.model_dump(), models=standing)

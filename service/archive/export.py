@@ -8,11 +8,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from service.instants import format_instants
-from service.registry import Entry
 from service.store import samples
 from service.store.connection import Connection
 from service.store.database import Database
 from service.store.samples import Samples
+from service.twins.registry import Entry
 
 Format = Literal["csv", "parquet"]
 MEDIA: dict[Format, str] = {"csv": "text/csv; charset=utf-8", "parquet": "application/vnd.apache.parquet"}

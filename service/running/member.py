@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from service.fleet.ownership import Leases
-from service.registry import Entry
 from service.store.errors import Missing, TwinGone
 from service.store.ownership import Changed, slot_of
+from service.twins.registry import Entry
 
 if TYPE_CHECKING:
     from service.fleet.bus import Bus
-    from service.http.deps import Service
+    from service.running.service import Service
     from service.settings import Settings
     from service.store.database import Database
 

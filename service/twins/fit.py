@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from service.errors import BadField
-from service.registry import Entry
+from service.twins.registry import Entry
 from twin_core.network.spec import Node, TwinSpec
 
 Json = dict[str, Any]

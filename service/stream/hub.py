@@ -10,11 +10,11 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from service.messages import Json, Stretch, dropped
-from service.metrics import Metrics
-from service.registry import Entry
-from service.store import stream
+from service.monitoring.metrics import Metrics
 from service.store.database import Database
+from service.stream import past
+from service.stream.messages import Json, Stretch, dropped
+from service.twins.registry import Entry
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -204,7 +204,7 @@ class Hub:
             messages = topic.since(position, AT_ONCE)
         else:
             names = (twin.channels, twin.sensors)
-            messages = await self._database.read(stream.since_seq, twin.key, *names, position, AT_ONCE_STORED)
+            messages = await self._database.read(past.since_seq, twin.key, *names, position, AT_ONCE_STORED)
         if not messages:
             return self._skip(position, topic.head)
         first, last = int(messages[0]["seq"]), int(messages[-1]["seq"])

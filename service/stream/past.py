@@ -1,8 +1,8 @@
 """The past of a stream: samples, residuals and events put back into the order of their numbers."""
 
-from service.messages import EventStretch, Json, ResidualStretch, SampleStretch, Stretch
 from service.store import events, residuals, samples
 from service.store.connection import Connection
+from service.stream.messages import EventStretch, Json, ResidualStretch, SampleStretch, Stretch
 
 
 def since_seq(

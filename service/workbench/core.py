@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from service.workbench import (
+from service.workbench.interface import (
     CalibrationTask,
     DiagnosisTask,
     Filtered,

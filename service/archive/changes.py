@@ -2,14 +2,14 @@
 
 from collections.abc import Sequence
 
+from service.archive.intake import take_in
 from service.instants import now_us
-from service.intake import take_in
-from service.messages import EventStretch, Stretch
-from service.registry import Entry
 from service.store import aside, events
 from service.store.aside import Deletion
 from service.store.connection import Connection
 from service.store.samples import Receipt
+from service.stream.messages import EventStretch, Stretch
+from service.twins.registry import Entry
 
 
 def delete(

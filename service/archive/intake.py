@@ -15,16 +15,16 @@ import numpy as np
 
 from service.instants import now_us
 from service.live.live import Live
-from service.messages import SampleStretch
-from service.metrics import Metrics
-from service.registry import Entry
+from service.monitoring.metrics import Metrics
 from service.store import samples
 from service.store.admission import admit
 from service.store.batch import MOST_VALUES, Batch
 from service.store.connection import Connection
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Receipt
-from service.streams import Hub, settle
+from service.stream.hub import Hub, settle
+from service.stream.messages import SampleStretch
+from service.twins.registry import Entry
 
 log = logging.getLogger("service")
 

@@ -1,0 +1,1 @@
+"""What goes into the archive, what changes it afterwards, and what leaves it."""

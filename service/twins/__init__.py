@@ -1,0 +1,1 @@
+"""The registered twins in memory, and which models fit them."""

@@ -1,0 +1,1 @@
+"""The science behind one small door: the interface, and twin_core behind it."""
