@@ -24,7 +24,7 @@ from service.workbench.interface import (
     Stretch,
     Telemetry,
 )
-from twin_core.errors import ModelError
+from twin_core.errors import ModelError, TwinError
 
 MOST_MODELS = 1024
 """So many models a worker process knows at a time, at some tens of kilobytes each."""
@@ -206,7 +206,10 @@ def _with_prior(spec: Any, siblings: Mapping[str, Any]) -> Any:
     from twin_core.family import declared, pool
 
     alike = _alike(spec, siblings)
-    return declared(spec, pool(alike)) if alike else spec
+    try:
+        return declared(spec, pool(alike)) if alike else spec
+    except (TwinError, np.linalg.LinAlgError):  # siblings that tell nothing must not stop a calibration
+        return spec
 
 
 def _beside_family(model: Any, siblings: Mapping[str, Any]) -> Json:
@@ -216,7 +219,10 @@ def _beside_family(model: Any, siblings: Mapping[str, Any]) -> Json:
     alike = _alike(model.spec, siblings) if len(model.free_names) else {}
     if not alike:
         return {}
-    own = pool({**alike, OWN: model}).members[OWN]
+    try:
+        own = pool({**alike, OWN: model}).members[OWN]
+    except (TwinError, np.linalg.LinAlgError):
+        return {}
     return {"family": {"siblings": len(alike), "differs": own.differs}}
 
 
