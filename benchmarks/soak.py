@@ -139,6 +139,7 @@ class Tally:
     memory_MB: list[tuple[float, float]] = field(default_factory=list)
     jobs: dict[str, int] = field(default_factory=dict)
     errors: list[str] = field(default_factory=list)
+    load: list[float] = field(default_factory=list)
 
     def note(self, what: str) -> None:
         """Count a fault."""
@@ -293,6 +294,7 @@ class Soak:
                 worker.start()
             while (now_s := time.monotonic()) < begun_s + self.length_s:
                 time.sleep(2.0)
+                self.tally.load.append(os.getloadavg()[0])
                 self.tally.memory_MB.append((now_s - killed_s, self.server.memory_MB()))
                 if now_s - killed_s >= self.kill_every_s and now_s < begun_s + self.length_s - self.calm_s - 30:
                     self.server.kill()
@@ -331,7 +333,7 @@ class Soak:
         return float(every.mean()) if every.size else float("nan"), int(every.size)
 
     def memory_MB(self) -> tuple[float, float, float]:
-        """Return the last process's memory: medians of the minute in which it was warm and of its last one; and the peak of all."""
+        """Return the last process's memory: medians of a minute once it was warm and of its last minute; and the peak of all."""
         looks = self.tally.memory_MB
         last = looks[max((i for i in range(1, len(looks)) if looks[i][0] < looks[i - 1][0]), default=0) :]
         warm = [memory for age_s, memory in last if WARM_UP_S <= age_s < WARM_UP_S + 60.0]
@@ -375,13 +377,16 @@ def main() -> int:
     parser.add_argument("--calm-min", type=float, default=15.0, help="at the end, without kills")
     parser.add_argument("--json", action="store_true", help="print what went wrong, too")
     given = parser.parse_args()
-    load = os.getloadavg()[0]
+    before = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as name:
         soak = Soak(given.twins, given.minutes, 60 * given.kill_every_min, 60 * given.calm_min, Path(name))
         soak.run()
         rows, is_well = soak.rows()
     table = markdown_table(["what", "measured", "wanted"], rows)
-    note = f"Load of the machine before and after: {load:.1f} and {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
+    note = (
+        f"Load of the machine: {before:.1f} before; {np.mean(soak.tally.load):.1f} on average and {max(soak.tally.load):.1f} at most "
+        f"meanwhile, on {os.cpu_count()} cores."
+    )
     save_table("soak", "A soak of the service", table, "benchmarks.soak", note)
     print(table)
     if given.json:
