@@ -384,8 +384,8 @@ def main() -> int:
         rows, is_well = soak.rows()
     table = markdown_table(["what", "measured", "wanted"], rows)
     note = (
-        f"Load of the machine: {before:.1f} before; {np.mean(soak.tally.load):.1f} on average and {max(soak.tally.load):.1f} at most "
-        f"meanwhile, on {os.cpu_count()} cores."
+        f"Load of the machine: {before:.1f} before; {np.mean(soak.tally.load):.1f} on average and {max(soak.tally.load):.1f} "
+        f"at most meanwhile, on {os.cpu_count()} cores."
     )
     save_table("soak", "A soak of the service", table, "benchmarks.soak", note)
     print(table)
