@@ -127,9 +127,10 @@ class Browser:
         found = f"document.querySelector({json.dumps(selector)})"
         self.until(found)
         for _ in range(50):
+            self.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
             self.evaluate(
-                f"window.hit = false; {found}.scrollIntoView({{block: 'center'}});"
-                f"{found}.addEventListener('click', () => {{ window.hit = true; }}, {{once: true, capture: true}})"
+                "window.hit = false; document.addEventListener('click', (e) => "
+                f"{{ window.hit ||= Boolean(e.target.closest({json.dumps(selector)})); }}, {{once: true, capture: true}})"
             )
             x, y, width, height = self.box(selector)
             for kind in ("mousePressed", "mouseReleased"):
