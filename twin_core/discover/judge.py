@@ -13,6 +13,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
+from twin_core.discover.told import score_needed, standard_score
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError
 from twin_core.simulate.rollout import hurried
@@ -24,6 +25,7 @@ N_VALIDATED, N_VALIDATED_FREE = 3, 8
 
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+SIZE_NOT_TOLD = "the record does not tell its size: other parameters of the model make up for it"
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
@@ -153,7 +155,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
-        examined = state.attempt(partial(_examined, state.trial, best, needed), best.labels)
+        examined = state.attempt(partial(examine, state.trial, best, needed, state.n_named), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         refused.append(own)
         if own.reason == NO_LAW and resembles:
@@ -172,13 +174,15 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
+def examine(simple: Trial, judged: Judged, needed: float, n_tried: int) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
 
     A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
     """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
+    if standard_score(simple, judged.trial) < score_needed(needed, n_tried):
+        return replace(judged, reason=SIZE_NOT_TOLD), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
