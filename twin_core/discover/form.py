@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from twin_core.discover import policy
 from twin_core.discover.confirm import Trial, try_effects, weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
@@ -12,14 +13,19 @@ from twin_core.effects.base import Effect, touched_nodes
 N_REFITS, N_RIVALS = 6, 2
 
 
-def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> bool:
+def leaves_a_repeatable_heat(
+    simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float
+) -> bool:
     """Return whether a free form of temperature is supported on top of named effects, at the nodes where they act.
 
     A law that merely resembles what is missing leaves the difference behind: not noise, not a wandering heat, but one
-    that comes back with the temperature. Then the heat is repeatable and the name is not.
+    that comes back with the temperature. Then the heat is repeatable and the name is not. It must show in the trajectories
+    as well, weighed against what the name removed from them.
 
     Parameters
     ----------
+    simple
+        Without the effects.
     trial
         With the effects, fitted.
     effects
@@ -31,7 +37,10 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
     """
     best, n_tried = _free_forms(trial, effects, needed)
     tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
-    return any(weigh(trial, top, n_tried).log_bayes_factor > most for top in _likeliest(trial, tops))
+    return any(
+        weigh(trial, top, n_tried).log_bayes_factor > most and _counts(simple, trial, top)
+        for top in _likeliest(trial, tops)
+    )
 
 
 def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> bool:
@@ -49,7 +58,17 @@ def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect
     """
     best, _ = _free_forms(simple, effects, needed)
     instead = [try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS]]
-    return any(weigh(rival, trial, 1).log_bayes_factor < -most for rival in _likeliest(simple, instead))
+    return any(
+        weigh(rival, trial, 1).log_bayes_factor < -most and _counts(simple, trial, rival)
+        for rival in _likeliest(simple, instead)
+    )
+
+
+def _counts(simple: Trial, trial: Trial, free: Trial) -> bool:
+    """Return whether a free form removes misfit beyond a name that is neither as small as a coarse network may leave beside a
+    right one, nor a small share of what the name removes."""
+    before, named, left = (float(np.mean(t.excess())) for t in (simple, trial, free))
+    return named - left > min(policy.MOST_COARSENESS, policy.REPEATABLE_SHARE * (before - named))
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:

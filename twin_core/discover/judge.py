@@ -13,7 +13,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.confirm import Evidence, Trial, Validation, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
-from twin_core.discover.told import score_needed, standard_score
+from twin_core.discover.told import least_score, score_needed
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError
 from twin_core.simulate.rollout import hurried
@@ -181,7 +181,7 @@ def examine(simple: Trial, judged: Judged, needed: float, n_tried: int) -> tuple
     """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
-    if standard_score(simple, judged.trial) < score_needed(needed, n_tried):
+    if least_score(simple, judged.trial) < score_needed(needed, n_tried):
         return replace(judged, reason=SIZE_NOT_TOLD), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
@@ -191,14 +191,18 @@ def examine(simple: Trial, judged: Judged, needed: float, n_tried: int) -> tuple
 
 
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
-    """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
+    """Return whether named effects are not the law of the heat that they stand for; a free form claims no law.
+
+    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better.
+    """
     named = [effect for effect in judged.effects if not effect.fallback]
     if not named:
         return False
     most = most_left(judged.evidence.log_bayes_factor, needed)
     with ThreadPoolExecutor(1) as pool:  # side by side, under the same deadline
         other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, judged.trial, named, needed, most)
-        return leaves_a_repeatable_heat(judged.trial, named, needed, most) or other.result()
+        heats = [effect for effect in named if "sensor" not in effect.where]
+        return (bool(heats) and leaves_a_repeatable_heat(simple, judged.trial, heats, needed, most)) or other.result()
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

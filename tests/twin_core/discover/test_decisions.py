@@ -301,7 +301,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
         Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
     )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
-    monkeypatch.setattr(judge, "standard_score", lambda *trials: score)
+    monkeypatch.setattr(judge, "least_score", lambda *trials: score)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: False)
     assert judge.examine(simple, option, NEEDED, 100)[0].reason == reason
 

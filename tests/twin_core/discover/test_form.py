@@ -82,7 +82,7 @@ def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[
     worth = weigh(base, trial, 1).log_bayes_factor
     assert worth > NEEDED  # either way the heater looks well supported
     most = most_left(worth, NEEDED)
-    assert leaves_a_repeatable_heat(trial, trial.effects, NEEDED, most) is left
+    assert leaves_a_repeatable_heat(base, trial, trial.effects, NEEDED, most) is left
     assert outdone_by_a_free_form(base, trial, trial.effects, NEEDED, most) is left
 
 
