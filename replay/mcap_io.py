@@ -5,7 +5,8 @@ becomes a column ``topic.field``. Viewers such as Foxglove, Lichtblick and PlotJ
 """
 
 import struct
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -15,8 +16,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
+from replay.bridges.foxglove_messages import SCHEMAS, Picture
 from replay.errors import RecordingError
-from replay.mcap_writer import LOG, VALUE, McapWriter
+from replay.mcap_writer import VALUE, McapWriter
 from replay.recording import Recording, align
 
 Samples = dict[str, tuple[list[int], list[float]]]
@@ -32,6 +34,7 @@ def write_mcap(
     units: Mapping[str, str] | None = None,
     metadata: Mapping[str, str] | None = None,
     attachments: Mapping[str, bytes] | None = None,
+    pictures: Sequence[Picture] = (),
 ) -> None:
     """Write columns to an MCAP file, messages in the order of time; the file appears whole or not at all.
 
@@ -49,6 +52,8 @@ def write_mcap(
         Text pairs kept in the file.
     attachments
         File name -> content of files that are kept in it.
+    pictures
+        Fields in the order of time, each written as a grid before the samples of its instant.
 
     Raises
     ------
@@ -61,7 +66,10 @@ def write_mcap(
     told = (recording.columns, recording.units, recording.metadata)
     with McapWriter(target, *told, attachments=attachments) as writer:
         rows = [(topic, column.tolist()) for topic, column in recording.columns.items()]
+        waiting = deque(pictures)
         for row, instant_ns in enumerate(recording.time_ns.tolist()):
+            while waiting and waiting[0].instant_ns <= instant_ns:
+                writer.picture(waiting.popleft())
             for topic, values in rows:
                 writer.add(topic, instant_ns, values[row])
 
@@ -120,8 +128,8 @@ def _read(source: Path, stream: IO[bytes], cut: bool) -> list[Recording]:
     samples: Samples = {}
     units: dict[str, str] = {}
     for schema, channel, message in reader.iter_messages(log_time_order=False):
-        if schema is not None and schema.name == LOG:
-            continue  # events, which are no telemetry
+        if schema is not None and schema.name in SCHEMAS:
+            continue  # events and pictures, which are no telemetry
         if channel.message_encoding != "json":
             raise RecordingError(
                 f"{source}: topic '{channel.topic}' is encoded as {channel.message_encoding}, not json"

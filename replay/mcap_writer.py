@@ -6,35 +6,49 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import orjson
 from mcap.writer import Writer
 
+from replay.bridges.events import Note
+from replay.bridges.foxglove_messages import (
+    EVENT,
+    EVENT_TOPIC,
+    GRID,
+    GRID_TOPIC,
+    LOG,
+    LOG_TOPIC,
+    SCHEMAS,
+    Picture,
+    event_of,
+    grid_of,
+    log_of,
+)
 from replay.errors import RecordingError
 
 METADATA_NAME = "thermal-twin"
 SCHEMA_NAME = "thermal_twin.Sample"
 VALUE = "value"
-LOG, LOG_TOPIC = "foxglove.Log", "/events"
-INFO, WARNING, ERROR = 2, 3, 4
-"""Levels of a log message."""
-_LOG_SCHEMA = {
-    "$schema": "https://json-schema.org/draft/2020-12/schema",
-    "title": LOG,
-    "type": "object",
-    "properties": {
-        "timestamp": {
-            "type": "object",
-            "title": "time",
-            "properties": {"sec": {"type": "integer", "minimum": 0}, "nsec": {"type": "integer", "minimum": 0}},
-        },
-        "level": {"type": "integer", "minimum": 0},
-        **{name: {"type": "string"} for name in ("message", "name", "file")},
-        "line": {"type": "integer", "minimum": 0},
-    },
-}
-"""The Log message of Foxglove, which its log panel shows."""
+
+
+def sample_schema(topic: str, unit: str | None) -> dict[str, Any]:
+    """Return the JSON Schema of one topic's samples. Viewers look schemas up by name, and each topic has its own unit."""
+    about = {"type": "number", "description": f"{topic} in {unit}" if unit else topic} | (
+        {"unit": unit} if unit else {}
+    )
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": f"{SCHEMA_NAME}.{topic}",
+        "type": "object",
+        "properties": {VALUE: about},
+        "required": [VALUE],
+    }
+
+
+def sample_bytes(value: float) -> bytes:
+    """Return one sample as a message."""
+    return b'{"value":%b}' % orjson.dumps(value)
 
 
 class McapWriter:
@@ -106,45 +120,41 @@ class McapWriter:
         if math.isinf(value) or instant_ns < 0:
             wrong = "is infinite" if math.isinf(value) else "has a time before 1970, which MCAP cannot express"
             raise RecordingError(f"{self._target}: a sample of channel '{topic}' {wrong}")
-        data = b'{"value":%b}' % orjson.dumps(value)
+        self._put(topic, instant_ns, sample_bytes(value))
+        self.count += 1
+
+    def tell(self, note: Note) -> None:
+        """Write an event as a log message and, once it is over, as an interval; RecordingError as of ``add``."""
+        if min(note.time_ms, note.since_ms or 0) < 0:
+            raise RecordingError(f"{self._target}: an event has a time before 1970, which MCAP cannot express")
+        self._message(LOG_TOPIC, LOG, 1_000_000 * note.time_ms, log_of(note))
+        interval = event_of(note)
+        if interval is not None:
+            self._message(EVENT_TOPIC, EVENT, 1_000_000 * note.time_ms, interval)
+
+    def picture(self, picture: Picture) -> None:
+        """Write a field as a grid; RecordingError as of ``add``."""
+        self._message(GRID_TOPIC, GRID, picture.instant_ns, grid_of(picture))
+
+    def _message(self, topic: str, schema: str, instant_ns: int, body: Mapping[str, Any]) -> None:
+        if topic not in self._channels:
+            number = self._writer.register_schema(schema, "jsonschema", orjson.dumps(SCHEMAS[schema]))
+            self._channels[topic] = int(self._writer.register_channel(topic, "json", number))
+        self._put(topic, instant_ns, orjson.dumps(body))
+
+    def _put(self, topic: str, instant_ns: int, data: bytes) -> None:
         try:
             self._writer.add_message(
                 self._channels[topic], instant_ns, data, publish_time=instant_ns, sequence=self.count
             )
         except OSError as error:
             raise self._refusal(error) from error
-        self.count += 1
-
-    def log(self, instant_ns: int, level: int, name: str, message: str) -> None:
-        """Write an event as a log message of Foxglove, under ``/events``; RecordingError as of ``add``."""
-        if instant_ns < 0:
-            raise RecordingError(f"{self._target}: an event has a time before 1970, which MCAP cannot express")
-        if LOG_TOPIC not in self._channels:
-            schema = self._writer.register_schema(LOG, "jsonschema", orjson.dumps(_LOG_SCHEMA))
-            self._channels[LOG_TOPIC] = int(self._writer.register_channel(LOG_TOPIC, "json", schema))
-        sec, nsec = divmod(instant_ns, 1_000_000_000)
-        body = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message, "name": name}
-        data = orjson.dumps({**body, "file": "", "line": 0})
-        try:
-            self._writer.add_message(self._channels[LOG_TOPIC], instant_ns, data, publish_time=instant_ns)
-        except OSError as error:
-            raise self._refusal(error) from error
 
     def _add_channel(self, topic: str) -> int:
         """Register one topic and its schema; return the channel's number."""
         unit = self._units.get(topic)
-        told = {"type": "number", "description": f"{topic} in {unit}" if unit else topic} | (
-            {"unit": unit} if unit else {}
-        )
-        name = f"{SCHEMA_NAME}.{topic}"  # viewers look schemas up by name, and each channel has its own unit
-        schema = {
-            "$schema": "https://json-schema.org/draft/2020-12/schema",
-            "title": name,
-            "type": "object",
-            "properties": {VALUE: told},
-            "required": [VALUE],
-        }
-        schema_id = self._writer.register_schema(name, "jsonschema", orjson.dumps(schema))
+        schema = sample_schema(topic, unit)
+        schema_id = self._writer.register_schema(schema["title"], "jsonschema", orjson.dumps(schema))
         return int(self._writer.register_channel(topic, "json", schema_id, {"unit": unit} if unit else {}))
 
     def _refusal(self, error: OSError) -> RecordingError:

@@ -1,16 +1,16 @@
-"""The recorder: follows the live stream of a twin and writes what arrives to an MCAP file."""
+"""The recorder: follows the live stream of a twin and passes what arrives on, to an MCAP file or to viewers."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
+from replay.bridges.events import Note, of_activations, of_alarms, of_anomalies, of_diagnoses
 from replay.errors import ReplayError
-from replay.mcap_writer import INFO, WARNING, McapWriter
 from service.client import ApiError, AsyncTwinClient, Unreachable
-from service.schemas import Archive, Message, Residuals, TwinDetail
+from service.schemas import Alarm, Anomaly, Archive, Job, Message, Residuals, TwinDetail
 
 Part = TypeVar("Part", Archive, Residuals)
 
@@ -27,6 +27,7 @@ class Tally:
 
     samples: int = 0
     residuals: int = 0
+    events: int = 0
     gaps: int = 0
     interruptions: int = 0
     last_time: str | None = None
@@ -44,8 +45,18 @@ def topics_of(twin: TwinDetail) -> tuple[list[str], dict[str, str]]:
     return [*twin.channels, *residuals], units | dict.fromkeys(residuals, "K")
 
 
+class Sink(Protocol):
+    """Where a recording goes: a file, or viewers that are connected."""
+
+    def add(self, topic: str, instant_ns: int, value: float) -> None:
+        """Take one sample."""
+
+    def tell(self, note: Note) -> None:
+        """Take one event."""
+
+
 class Recorder:
-    """Writes one twin's samples and innovations to a file as they arrive.
+    """Writes one twin's samples, innovations and events to a sink as they arrive.
 
     A connection that breaks is taken up again after the last message. Messages that the service dropped, because the
     recorder was too slow, are fetched from the archive; a sample may then stand in the file twice, with the same value.
@@ -55,14 +66,19 @@ class Recorder:
         self,
         client: AsyncTwinClient,
         twin: str,
-        writer: McapWriter,
+        sink: Sink,
         progress: Callable[[Tally], None] = no_tally,
+        service_url: str = "",
     ) -> None:
-        """Record ``twin`` through ``client`` into ``writer``; ``progress`` is called now and then."""
-        self._client, self._twin, self._writer, self._progress = client, twin, writer, progress
+        """Record ``twin`` through ``client`` into ``sink``; ``progress`` is called now and then.
+
+        ``service_url`` is where links to reports begin.
+        """
+        self._client, self._twin, self._sink, self._progress = client, twin, sink, progress
+        self._reports = f"{service_url.rstrip('/')}/v1/twins/{twin}/diagnoses"
         self.tally = Tally()
         self._last_ns = -1
-        self._said: set[tuple[int, str]] = set()
+        self._told: set[str] = set()
 
     async def take_archive(self, start: str | None) -> None:
         """Write what the archive holds from an instant on, or all of it; ReplayError if the service refuses."""
@@ -70,6 +86,21 @@ class Recorder:
             await self._fetch(start)
         except (ApiError, Unreachable) as error:
             raise ReplayError(f"twin '{self._twin}': {error}") from error
+
+    async def take_events(self, start: str | None = None) -> None:
+        """Tell what the service knows: anomalies and limits that last or ended after an instant, all models and diagnoses.
+
+        ApiError or Unreachable as the client raises them.
+        """
+        client, twin = self._client, self._twin
+        alarms = [alarm for alarm in await client.alarms(twin) if not start or not alarm.stop or alarm.stop >= start]
+        notes = [
+            *of_anomalies(await client.anomalies(twin, start=start)),
+            *of_alarms(alarms),
+            *of_activations(await client.activations(twin)),
+            *of_diagnoses(await client.jobs(twin, "diagnosis"), self._reports),
+        ]
+        self._tell(notes)
 
     async def follow(self, after_seq: int) -> None:
         """Write what arrives until cancelled; ReplayError if the service refuses."""
@@ -96,7 +127,13 @@ class Recorder:
             self._write(message.time, values, is_sample=False)
             self.tally.residuals += 1
         elif message.type == "anomaly":
-            self._say(body["anomaly"])
+            self._tell(of_anomalies([Anomaly.model_validate(body["anomaly"])]))
+        elif message.type == "alarm":
+            self._tell(of_alarms([Alarm.model_validate(body["alarm"])]))
+        elif message.type == "model" and body["active"]:
+            self._tell(of_activations(await self._client.activations(self._twin)))
+        elif message.type == "job" and (job := Job.model_validate(body["job"])).kind == "diagnosis" and job.done:
+            self._tell(of_diagnoses(await self._client.jobs(self._twin, "diagnosis"), self._reports))
         elif message.type == "dropped":
             self.tally.gaps += 1
             await self._fetch(self.tally.last_time)
@@ -115,18 +152,14 @@ class Recorder:
             self._progress(self.tally)
         if head.active_model is not None:
             await self._fetch_residuals(span)
+        await self.take_events(start)
 
-            for found in await self._client.anomalies(self._twin, start=_text(span[0]), stop=_text(span[1])):
-                self._say(found.model_dump())
-
-    def _say(self, anomaly: dict[str, Any]) -> None:
-        """Write that an anomaly began, or that it ended, once each, as a log message."""
-        for what, at in (("begins", anomaly["start"]), ("ends", anomaly["stop"])):
-            if at is not None and (anomaly["id"], what) not in self._said:
-                self._said.add((anomaly["id"], what))
-                cause = f" ({anomaly['cause']['effect']})" if anomaly["cause"] else ""
-                level = WARNING if what == "begins" else INFO
-                self._writer.log(1000 * _us(at), level, anomaly["sensor"], f"{what}: {anomaly['message']}{cause}")
+    def _tell(self, notes: Iterable[Note]) -> None:
+        """Write events, once each, in the order of time."""
+        for note in sorted((note for note in notes if note.key not in self._told), key=lambda note: note.time_ms):
+            self._told.add(note.key)
+            self._sink.tell(note)
+            self.tally.events += 1
 
     async def _fetch_residuals(self, span: tuple[int, int]) -> None:
         try:
@@ -156,7 +189,7 @@ class Recorder:
         instant_ns = 1000 * _us(time)
         for name, value in values.items():
             if value is not None:
-                self._writer.add(name, instant_ns, value)
+                self._sink.add(name, instant_ns, value)
         if is_sample and instant_ns > self._last_ns:
             self._last_ns, self.tally.last_time = instant_ns, time
 

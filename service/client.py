@@ -352,6 +352,18 @@ class AsyncTwinClient:
         """Return anomalies between ``start`` and ``stop``."""
         return (await self.send(calls.anomalies(name, parameters))).anomalies
 
+    async def alarms(self, name: str) -> list[schemas.Alarm]:
+        """Return the alarms of limits, those first that last and are not shelved."""
+        return (await self.send(calls.alarms(name))).alarms
+
+    async def activations(self, name: str) -> list[schemas.Activation]:
+        """Return when and why versions became the active one, the newest first."""
+        return (await self.send(calls.models(name))).activations
+
+    async def jobs(self, name: str, kind: schemas.JobKind) -> list[schemas.Job]:
+        """Return the jobs of one kind, the newest first."""
+        return (await self.send(calls.jobs(name, kind))).jobs
+
     async def register(self, specification: Mapping[str, Any]) -> schemas.TwinDetail:
         """Register a specification."""
         return await self.send(calls.register(specification))

@@ -19,8 +19,8 @@ from typing import Any, TypeVar
 
 from replay.bridges.config import YamcsConfig
 from replay.bridges.errors import Away, BridgeError, ServiceAway
+from replay.bridges.events import of_activations, of_alarms, of_anomalies, of_diagnoses
 from replay.bridges.instants import now_ms, parse_utc_ms, service_ms, to_text
-from replay.bridges.yamcs_events import of_activations, of_alarms, of_anomalies, of_diagnoses
 from replay.bridges.yamcs_gateway import Row, YamcsGateway
 from replay.bridges.yamcs_names import (
     CATCHING_UP,

@@ -25,6 +25,7 @@ from yamcs.client import (
 )
 
 from replay.bridges.errors import Away, BridgeError
+from replay.bridges.events import Note
 from replay.bridges.instants import to_datetime, to_ms
 
 for _chatty in ("yamcs-client", "websocket"):
@@ -52,19 +53,6 @@ class Declared:
     kind: str
     ranges: Mapping[str, tuple[float | None, float | None]]
     has_contexts: bool = False
-
-
-@dataclass(frozen=True)
-class EventNote:
-    """An event; ``key`` makes it the same event when it is sent again."""
-
-    key: str
-    time_ms: int
-    severity: str
-    kind: str
-    message: str
-    number: int
-    link: str | None = None
 
 
 class _Patient(HTTPAdapter):
@@ -201,7 +189,7 @@ class YamcsGateway:
                 timeout=TIMEOUT_S,
             )
 
-    def send_event(self, source: str, note: EventNote) -> None:
+    def send_event(self, source: str, note: Note) -> None:
         """Send an event; one with the same time, source and number is the same event."""
         extra = {"key": note.key} | ({"link": note.link} if note.link else {})
         with self._told():

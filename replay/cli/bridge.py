@@ -70,7 +70,7 @@ def yamcs(
     settings = read_config(config)
     check_url(service)
     check_url(url)
-    _need_yamcs()
+    _need("yamcs", "Yamcs' client", "yamcs")
     from replay.bridges.yamcs_bridge import YamcsBridge
     from service.client import TwinClient
 
@@ -111,7 +111,7 @@ def xtce(config: Path, service: str, key: str | None, out: Path) -> None:
 
     settings = read_config(config)
     check_url(service)
-    _need_yamcs()
+    _need("yamcs", "Yamcs' client", "yamcs")
     from replay.bridges.yamcs_mdb import write_xtce
     from replay.bridges.yamcs_names import published_names
 
@@ -154,7 +154,7 @@ def limits(url: str, instance: str, config: Path, user: str | None, spec: Path, 
     settings = read_config(config)
     check_url(url)
     document = dump_spec(load_spec(spec))
-    _need_yamcs()
+    _need("yamcs", "Yamcs' client", "yamcs")
     from replay.bridges.yamcs_mdb import read_limits
 
     with _connected(url, instance, user) as gateway:
@@ -171,14 +171,59 @@ def limits(url: str, instance: str, config: Path, user: str | None, spec: Path, 
     print_line(f"wrote {out}: limits of {', '.join(found) if found else 'no channel'}")
 
 
-def _need_yamcs() -> None:
-    """Say what to install where Yamcs' client is not."""
+@bridge.command(
+    cls=Command,
+    short_help="Samples, residuals and events to viewers of Foxglove, live.",
+    example="twin bridge foxglove --twin benchsat --service http://127.0.0.1:8000 --port 8765",
+)
+@_service
+@click.option("--twin", required=True, help="The twin's id.")
+@_key
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to listen on.")
+@click.option("--port", default=8765, show_default=True, type=click.IntRange(0, 65535), help="0 takes any free one.")
+def foxglove(service: str, twin: str, key: str | None, host: str, port: int) -> None:
+    """Serve a running twin to viewers of Foxglove by web socket, until interrupted.
+
+    The web socket asks nobody for a key: whoever reaches it sees the twin's telemetry.
+    """
+    import asyncio
+
+    from replay.cli.play import check_url
+
+    check_url(service)
+    _need("foxglove", "Foxglove's SDK", "foxglove")
+    asyncio.run(_serve_foxglove(service, twin, key, host, port))
+
+
+async def _serve_foxglove(service: str, twin: str, key: str | None, host: str, port: int) -> None:
+    from replay.bridges.foxglove_server import FoxgloveServer
+    from replay.cli.console import print_line
+    from replay.cli.record import follow
+    from replay.errors import ReplayError
+    from replay.recorder import Recorder, topics_of
+    from service.client import ApiError, AsyncTwinClient, Unreachable
+
+    async with AsyncTwinClient(service, key) as client:
+        try:
+            head = await client.twin(twin)
+            topics, units = topics_of(head)
+            with FoxgloveServer(twin, topics, units, host, port) as server:
+                recorder = Recorder(client, twin, server, service_url=service)
+                await recorder.take_events()
+                print_line(f"listening on {server.url}")
+                await follow(recorder, head.seq, None)
+        except (ApiError, Unreachable) as error:
+            raise ReplayError(f"twin '{twin}': {error}") from error
+
+
+def _need(module: str, what: str, extra: str) -> None:
+    """Say what to install where a library is not."""
     from importlib.util import find_spec
 
     from replay.bridges.errors import BridgeError
 
-    if find_spec("yamcs") is None:
-        raise BridgeError("this needs Yamcs' client: pip install 'thermal-twin[yamcs]'")
+    if find_spec(module) is None:
+        raise BridgeError(f"this needs {what}: pip install 'thermal-twin[{extra}]'")
 
 
 def _connected(url: str, instance: str, user: str | None, processor: str = "realtime") -> "YamcsGateway":

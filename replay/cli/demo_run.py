@@ -19,6 +19,7 @@ from replay.source import load
 from service.client import ApiError, TwinClient, Unreachable
 from service.schemas import Job
 from twin_core.fem.demo import demo_scenario
+from twin_core.fem.film import Film
 from twin_core.fem.hidden.base import WHERE_KEYS
 from twin_core.fem.scenario import Scenario
 from twin_core.fem.simulate import simulate
@@ -28,6 +29,8 @@ from twin_core.network.spec_io import dump_spec
 
 RECORDING = "orbits.mcap"
 HOLDOUT = 0.3
+PICTURE_S = 300.0
+"""Between two pictures of the temperature field in the recording."""
 
 Place = tuple[str, frozenset[tuple[str, frozenset[str]]]]
 """An effect's name and where it acts, for comparison: pairs have no order."""
@@ -110,12 +113,13 @@ def run_demo(effect: str, seed: int, out: Path) -> Iterator[Outcome]:
 
 
 def _record(scenario: Scenario, spec: TwinSpec, path: Path) -> None:
-    """Simulate the orbits and write what the sensors read."""
+    """Simulate the orbits and write what the sensors read, and the field as pictures for a viewer."""
+    film = Film(scenario, PICTURE_S)
     with progress_bar("simulating orbits") as progress:
-        record = simulate(scenario, progress).record
+        record = simulate(scenario, progress, film.take).record
     units = {name: channel.unit for name, channel in scenario.channels.items()}
     declared = {"specification.json": to_json(dump_spec(spec)).encode()}
-    save_record(path, record, units, {"scenario": scenario.scenario}, declared)
+    save_record(path, record, units, {"scenario": scenario.scenario}, declared, film)
 
 
 def _operate(

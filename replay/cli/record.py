@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 def record(
     url: str, twin: str, out: Path, start: str | None, duration: float | None, key: str | None, as_json: bool
 ) -> None:
-    """Record the samples and innovations of a running twin until Ctrl-C, a SIGTERM or the end of --duration.
+    """Record the samples, innovations and events of a running twin until Ctrl-C, a SIGTERM or the end of --duration.
 
     The recording outlives restarts of the service; the file appears when it ends.
     """
@@ -73,15 +73,15 @@ async def _record(
             progress_bar("recording") as progress,
             McapWriter(out, topics, units, {"twin": twin}, attachments=declared, keep=True) as writer,
         ):
-            recorder = Recorder(client, twin, writer, lambda tally: progress(0.0, f"{tally.samples} samples"))
+            recorder = Recorder(client, twin, writer, lambda tally: progress(0.0, f"{tally.samples} samples"), url)
             if start is not None:
                 await recorder.take_archive(None if start == "all" else start)
             if duration_s != 0.0:
-                await _follow(recorder, head.seq, duration_s)
+                await follow(recorder, head.seq, duration_s)
     return recorder.tally
 
 
-async def _follow(recorder: "Recorder", after_seq: int, duration_s: float | None) -> None:
+async def follow(recorder: "Recorder", after_seq: int, duration_s: float | None) -> None:
     """Record until time is up or the process is asked to end."""
     task = asyncio.create_task(recorder.follow(after_seq))
     loop = asyncio.get_running_loop()

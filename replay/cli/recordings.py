@@ -3,9 +3,11 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from replay.bridges.foxglove_messages import Picture
 from replay.errors import ReplayError
 from replay.mapping import apply_mapping, map_topics
 from replay.mcap_io import read_mcap, read_mcap_segments, write_mcap
@@ -25,6 +27,9 @@ from twin_core.telemetry_csv import (
     write_columns,
 )
 from twin_core.units import format_instant, from_si, to_si
+
+if TYPE_CHECKING:
+    from twin_core.fem.film import Film
 
 DATED = "dated"
 """Metadata of an MCAP file: "false" where log times are seconds since an unknown start."""
@@ -154,8 +159,12 @@ def save_record(
     units: Mapping[str, str | None],
     metadata: Mapping[str, str],
     attachments: Mapping[str, bytes] | None = None,
+    film: "Film | None" = None,
 ) -> None:
-    """Write a record in the units given, as CSV, or MCAP with attachments; the file appears whole or not at all."""
+    """Write a record in the units given, as CSV or MCAP; the latter with attachments and pictures of the field.
+
+    The file appears whole or not at all.
+    """
     check_suffix(path)
     if path.suffix == ".csv":
         write_columns(path, record, dict(units))
@@ -166,7 +175,15 @@ def save_record(
     columns = {name: from_si(values, units[name]) for name, values in record.values.items()}
     stated = {name: unit for name, unit in units.items() if unit is not None}
     dated = "false" if record.epoch_ns is None else "true"
-    write_mcap(path, time_ns, columns, stated, {**metadata, DATED: dated}, attachments)
+    pictures = [] if film is None else _pictures(film, record.epoch_ns or 0)
+    write_mcap(path, time_ns, columns, stated, {**metadata, DATED: dated}, attachments, pictures)
+
+
+def _pictures(film: "Film", epoch_ns: int) -> list[Picture]:
+    return [
+        Picture(epoch_ns + round(time_s * 1e9), field, film.origin_m, film.cell_m)
+        for time_s, field in zip(film.time_s, film.temperature_K, strict=True)
+    ]
 
 
 def check_suffix(path: Path, suffixes: Sequence[str] = SUFFIXES) -> None:

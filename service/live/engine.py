@@ -3,13 +3,14 @@
 import asyncio
 import logging
 import multiprocessing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
 from service.errors import Refusal
 from service.jobs.executor import prepare_worker
+from service.live.batches import Batches
 from service.workbench.interface import (
     Filtered,
     Forecasted,
@@ -18,6 +19,7 @@ from service.workbench.interface import (
     MakeWorkbench,
     Masks,
     Outcome,
+    Stretch,
     Telemetry,
 )
 
@@ -25,6 +27,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 WORKERS = 2
+TOGETHER = 256
+"""Most twins that a worker process filters at once: some tens of milliseconds."""
+SHORT = 64
+"""Stretches of more samples go by themselves: nobody shall wait for a twin that catches up."""
 log = logging.getLogger("service.live")
 
 
@@ -39,10 +45,17 @@ class Engine:
         """Start nothing yet: the first question starts the first process."""
         self._workbench = workbench
         self._pool: ProcessPoolExecutor | None = None
+        self._filters = Batches(self._assimilate, WORKERS, TOGETHER)
 
     async def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry."""
-        return await self._ask(_assimilate, self._workbench, document, telemetry, state)
+        """Filter a stretch of telemetry; short ones that wait at the same time go together."""
+        stretch = Stretch(document, telemetry, state)
+        if telemetry.time_us.size <= SHORT:
+            return await self._filters.ask(stretch)
+        (found,) = await self._assimilate([stretch])
+        if isinstance(found, Exception):
+            raise found
+        return found
 
     async def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model."""
@@ -67,6 +80,12 @@ class Engine:
     async def inspect(self, document: Json) -> Outcome:
         """Check a model that was made elsewhere."""
         return await self._ask(_inspect, self._workbench, document)
+
+    async def _assimilate(self, stretches: list[Stretch]) -> Sequence[Filtered | Exception]:
+        try:
+            return await self._ask(_assimilate, self._workbench, stretches)
+        except WorkerDied as error:  # over one of them, which shows where each goes by itself
+            return [error] if len(stretches) == 1 else [(await self._assimilate([one]))[0] for one in stretches]
 
     async def close(self) -> None:
         """End the processes."""
@@ -95,8 +114,8 @@ def _start(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=context, initializer=prepare_worker)
 
 
-def _assimilate(workbench: MakeWorkbench, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-    return workbench().assimilate(document, telemetry, state)
+def _assimilate(workbench: MakeWorkbench, stretches: Sequence[Stretch]) -> Sequence[Filtered | Exception]:
+    return workbench().assimilate(stretches)
 
 
 def _memory_s(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> float:

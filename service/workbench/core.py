@@ -21,9 +21,13 @@ from service.workbench.interface import (
     Masks,
     Outcome,
     Progress,
+    Stretch,
     Telemetry,
 )
 from twin_core.errors import ModelError
+
+MOST_MODELS = 1024
+"""So many models a worker process knows at a time, at some tens of kilobytes each."""
 
 
 class CoreWorkbench:
@@ -93,19 +97,23 @@ class CoreWorkbench:
         model = _model_of(document)
         return _outcome(model, {"rmse_K": model.summary.get("rmse_K"), "on": "its own training data"}, None)
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry; the state carries the evidence against the model along."""
-        from twin_core.anomaly.sufficiency import follow_evidence
-        from twin_core.assimilate import assimilate
+    def assimilate(self, stretches: Sequence[Stretch]) -> list[Filtered | Exception]:
+        """Filter stretches of telemetry together; each state carries the evidence against its model along."""
+        from twin_core.assimilate.together import Question, assimilate_together
 
-        model = _cached_model(document)
-        done = assimilate(model, _record(model.spec, telemetry), state)
-        if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
-            raise ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
-        scaled = done.innovation_K / done.innovation_std_K
-        evidence, _ = follow_evidence((state or {}).get("evidence"), done.sensors, scaled)
-        after = done.state | {"evidence": evidence}
-        return Filtered(done.sensors, done.innovation_K, done.innovation_std_K, done.nis, after)
+        questions: list[Question | Exception] = []
+        for stretch in stretches:
+            try:
+                member = _cached_member(stretch.document)
+                questions.append(Question(member, _record(member.model.spec, stretch.telemetry), stretch.state))
+            except Exception as error:
+                questions.append(error)
+        done = iter(assimilate_together([question for question in questions if isinstance(question, Question)]))
+        found = [question if isinstance(question, Exception) else next(done) for question in questions]
+        return [
+            one if isinstance(one, Exception) else _filtered(one, stretch.state)
+            for one, stretch in zip(found, stretches, strict=True)
+        ]
 
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant."""
@@ -234,9 +242,27 @@ def _model_of(document: Json) -> Any:
     return CalibratedModel.from_json(document)
 
 
-@lru_cache(maxsize=8)
+def _filtered(done: Any, state: Json | None) -> Filtered | Exception:
+    from twin_core.anomaly.sufficiency import follow_evidence
+
+    if not (np.isfinite(done.mean_K).all() and np.isfinite(done.covariance_K2).all()):
+        return ModelError("the filter diverges on these samples; check readings and inputs, or recalibrate")
+    scaled = done.innovation_K / done.innovation_std_K
+    evidence, _ = follow_evidence((state or {}).get("evidence"), done.sensors, scaled)
+    return Filtered(
+        done.sensors, done.innovation_K, done.innovation_std_K, done.nis, done.state | {"evidence": evidence}
+    )
+
+
+@lru_cache(maxsize=MOST_MODELS)
+def _cached_member(document: str) -> Any:
+    from twin_core.assimilate.together import Member
+
+    return Member.of(_model_of(orjson.loads(document)))
+
+
 def _cached_model(document: str) -> Any:
-    return _model_of(orjson.loads(document))
+    return _cached_member(document).model
 
 
 def _outcome(model: Any, validation: Json, rival_rmse_K: float | None) -> Outcome:

@@ -1,7 +1,7 @@
 """The science behind one small door: what the service asks for, in plain arrays and JSON that travel between processes."""
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -50,6 +50,15 @@ class Telemetry:
             digest.update(name.encode())
             digest.update(np.ascontiguousarray(self.values[name]).tobytes())
         return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Telemetry to be filtered with the model of a document, from a state whose instant is that of its first sample."""
+
+    document: str
+    telemetry: Telemetry
+    state: Json | None
 
 
 @dataclass(frozen=True)
@@ -145,8 +154,8 @@ class Workbench(Protocol):
     def inspect(self, document: Json) -> Outcome:
         """Check a model that was made elsewhere; raise TwinError if it is not one."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry; with a state its first sample is the one that the state already knows."""
+    def assimilate(self, stretches: Sequence[Stretch]) -> Sequence[Filtered | Exception]:
+        """Filter stretches of telemetry, of one twin each; for each return what it gives, or the error that it raises."""
 
     def memory_s(self, document: str, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model in seconds, linearised where the telemetry begins."""

@@ -1,22 +1,27 @@
 """The page of the control room: each of its commands runs, and its configuration is one."""
 
+import asyncio
 import json
 import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import yaml
 
 from replay.bridges.config import YamcsConfig
+from replay.bridges.foxglove_messages import GRID_TOPIC, LOG_TOPIC
 from replay.cli.main import main
 from tests.ground.openmct import DIST, NODE
 from tests.ground.test_yamcs import feed
 from tests.ground.yamcs import Yamcs
 from tests.replay.test_convert import GPS_S, SPEC, packet, rows, xtce
+from tests.replay.test_foxglove import heard, messages, viewer
 from tests.service.conftest import SPEC as BENCHSAT
 from tests.service.server import Server
 
@@ -76,6 +81,43 @@ def test_files_are_converted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for line in lines:
         assert main(shlex.split(line)[1:]) == 0, line
     assert [float(row["T_a"]) for row in rows(tmp_path / "telemetry.csv")] == pytest.approx([293.15] * 3)
+
+
+@pytest.mark.e2e
+def test_foxglove_is_served_and_recorded(service: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A viewer that speaks Foxglove's protocol hears what is ingested after it subscribed, and what happened before."""
+    pytest.importorskip("foxglove")
+    simulate, record, serve = (
+        line.replace("examples/", f"{ROOT}/examples/").replace("http://127.0.0.1:8000", service.url)
+        for line in commands("Foxglove")
+    )
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(simulate)[1:]) == 0
+    assert len(messages(tmp_path / "orbits.mcap", GRID_TOPIC)) == 77  # 45600 s, and the beginning
+    client = service.client()
+    times = [1_772_323_200.0 + 60.0 * k for k in range(40)]
+    client.ingest("benchsat", times, {"T_px": [290.0] * 40, "Q_px": [40.0] * 40})
+    client.wait("benchsat", client.calibrate("benchsat"))
+    assert main(shlex.split(record)[1:]) == 0
+    told = [body["message"] for body, _ in messages(tmp_path / "pass.mcap", LOG_TOPIC)]
+    assert told == ["model version 1 is active: the first model"]
+
+    words = [sys.executable, "-m", "replay.cli.main", *shlex.split(serve.replace("--port 8765", "--port 0"))[1:]]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().removeprefix("listening on ").strip()
+
+            async def watch() -> None:
+                async with viewer(url, ["T_px", LOG_TOPIC]) as (socket, ids, _):
+                    assert [body["message"] for _, _, body in await heard(socket, ids, 1)] == told
+                    await asyncio.to_thread(client.ingest, "benchsat", [1_772_330_000.5], {"T_px": [301.25]})
+                    assert await heard(socket, ids, 1) == [("T_px", 1_772_330_000_500_000_000, {"value": 301.25})]
+
+            asyncio.run(watch())
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(20) == 0
 
 
 def test_grafana_finds_its_files(tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from service.workbench.interface import (
     Masks,
     Outcome,
     Progress,
+    Stretch,
     Telemetry,
 )
 from twin_core.errors import ModelError
@@ -71,7 +72,17 @@ class FakeWorkbench:
             raise ModelError("spec: is missing")
         return Outcome(document, {}, {"rmse_K": 1.0}, [])
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def assimilate(self, stretches: Sequence[Stretch]) -> list[Filtered | Exception]:
+        """Filter one stretch after the other."""
+        found: list[Filtered | Exception] = []
+        for stretch in stretches:
+            try:
+                found.append(self.filtered(stretch.document, stretch.telemetry, stretch.state))
+            except Exception as error:
+                found.append(error)
+        return found
+
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         """Predict that nothing changes: innovations are first differences, the state the last readings."""
         if "poison" in document and not Path(document[document.index("/") :].split('"')[0]).exists():
             os.kill(os.getpid(), 9)

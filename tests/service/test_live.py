@@ -312,10 +312,10 @@ def test_late_samples_of_two_records_end_each_in_its_own(client: AppClient) -> N
 class Powered(FakeWorkbench):
     """Gives the power that holds for the NIS."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         power = telemetry.values["Q_px"]
         last = np.maximum.accumulate(np.where(np.isfinite(power), np.arange(power.size), 0))
-        return replace(super().assimilate(document, telemetry, state), nis=power[last])
+        return replace(super().filtered(document, telemetry, state), nis=power[last])
 
 
 @pytest.mark.parametrize(
@@ -341,9 +341,9 @@ def test_an_input_that_came_late_holds_over_a_long_gap(
 class Slow(FakeWorkbench):
     """Takes more than a second for what the archive of a test holds."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         time.sleep(1.2 if telemetry.time_us.size > 90 else 0.0)
-        return super().assimilate(document, telemetry, state)
+        return super().filtered(document, telemetry, state)
 
 
 def test_a_clock_that_stays_wrong_does_not_hold_up_the_present(make_client) -> None:
@@ -489,10 +489,10 @@ def test_a_rollback_finds_its_anomalies_as_they_were(client: AppClient) -> None:
 class Gated(FakeWorkbench):
     """Assimilates once a file is there."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         while not Path(os.environ["FAKE_GATE"]).exists():
             time.sleep(0.02)
-        return super().assimilate(document, telemetry, state)
+        return super().filtered(document, telemetry, state)
 
 
 def test_a_twin_says_while_it_catches_up(make_client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

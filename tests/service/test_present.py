@@ -22,14 +22,14 @@ LONG = 40_000
 class Gated(FakeWorkbench):
     """Assimilates a block of what lies before 30 000 s for each ticket that it finds; a gate lets all pass."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         folder = Path(os.environ["FAKE_GATE"])
         while telemetry.time_us[-1] < 30_000e6 and not (folder / "open").exists():
             if (folder / "ticket").exists():
                 (folder / "ticket").unlink()
                 break
             time.sleep(0.02)
-        return super().assimilate(document, telemetry, state)
+        return super().filtered(document, telemetry, state)
 
 
 @pytest.fixture
@@ -165,10 +165,10 @@ def test_a_service_that_starts_behind_a_long_archive_knows_the_present_at_once(m
 class Powered(FakeWorkbench):
     """Gives the power that holds for the NIS."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
         power = telemetry.values["Q_px"]
         last = np.maximum.accumulate(np.where(np.isfinite(power), np.arange(power.size), 0))
-        return replace(super().assimilate(document, telemetry, state), nis=power[last])
+        return replace(super().filtered(document, telemetry, state), nis=power[last])
 
 
 def test_inputs_hold_that_were_commanded_long_before_the_scout_begins(make_client, gate: Path) -> None:

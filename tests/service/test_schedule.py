@@ -75,8 +75,8 @@ def test_a_refutation_must_last_and_a_model_that_recovers_is_left_alone() -> Non
 class Refuting(FakeWorkbench):
     """Says that telemetry speaks against its model."""
 
-    def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        done = super().assimilate(document, telemetry, state)
+    def filtered(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
+        done = super().filtered(document, telemetry, state)
         return replace(done, state=done.state | {"evidence": {"sensors": {}, "most": 30.0}})
 
 

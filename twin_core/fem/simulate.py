@@ -1,6 +1,6 @@
 """Run scenarios: one, or several that share a field as several right-hand sides at once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -62,7 +62,15 @@ class Simulation:
     truth: Truth
 
 
-def simulate(scenario: Scenario, progress: Progress = no_progress) -> Simulation:
+Watch = Callable[[float, FloatArray], None]
+"""Hears the time in seconds from the start of the record, and the temperatures (n_unknowns, n_cases), after each step."""
+
+
+def no_watch(time_s: float, temperature_K: FloatArray) -> None:
+    """Look away: the default of a run."""
+
+
+def simulate(scenario: Scenario, progress: Progress = no_progress, watch: Watch = no_watch) -> Simulation:
     """Return the run of one scenario.
 
     Raises
@@ -70,10 +78,12 @@ def simulate(scenario: Scenario, progress: Progress = no_progress) -> Simulation
     ModelError
         If a step does not converge.
     """
-    return simulate_many([scenario], progress)[0]
+    return simulate_many([scenario], progress, watch)[0]
 
 
-def simulate_many(scenarios: Sequence[Scenario], progress: Progress = no_progress) -> list[Simulation]:
+def simulate_many(
+    scenarios: Sequence[Scenario], progress: Progress = no_progress, watch: Watch = no_watch
+) -> list[Simulation]:
     """Return the runs of scenarios that share geometry, materials and steps, solved side by side.
 
     Raises
@@ -90,7 +100,7 @@ def simulate_many(scenarios: Sequence[Scenario], progress: Progress = no_progres
         for scenario, path in zip(scenarios, paths, strict=True)
     ]
     switches = [_switches(scenario, field) for scenario in scenarios]
-    history = _run(field, clock, scenarios, drivings, switches, progress)
+    history = _run(field, clock, scenarios, drivings, switches, progress, watch)
     for path, working in zip(paths, switches, strict=True):
         path.update({switch.thermostat.channel: switch.path(clock.start_s) for switch in working})
     return [
@@ -141,6 +151,7 @@ def _run(
     drivings: Sequence[Driving],
     switches: Sequence[Sequence[Switch]],
     progress: Progress,
+    watch: Watch,
 ) -> _History:
     """Step all cases through the whole clock."""
     n_cases, n_steps = len(scenarios), clock.start_s.size
@@ -158,6 +169,7 @@ def _run(
     inputs_W = np.stack([driving.inputs_W for driving in drivings], axis=-1)
     boundary_K = np.stack([driving.boundary_K for driving in drivings], axis=-1)
     history.readings_K[0], history.regions_K[0] = field.readings @ temperature_K, means @ temperature_K
+    watch(float(clock.start_s[0]), temperature_K)
     for n, time_s in enumerate(clock.start_s):
         hidden.begin(n, float(time_s), temperature_K)
         drive = Drive(inputs_W[n], boundary_K[n], hidden.heat_W if hidden.any else None)
@@ -168,6 +180,7 @@ def _run(
         temperature_K = after
         history.readings_K[n + 1], history.regions_K[n + 1] = field.readings @ after, means @ after
         history.hidden_W[n + 1] = hidden.by_region_W()
+        watch(float(time_s) + clock.step_s, temperature_K)
         if n % 64 == 0:
             progress(n / n_steps, f"simulating, {time_s / 3600.0:.1f} h")
     progress(1.0, "simulated")

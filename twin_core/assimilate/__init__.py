@@ -112,7 +112,7 @@ def memory_s(model: CalibratedModel, record: Record) -> float:
         If the record lacks an input that the model needs, or holds no reading.
     """
     network = model.network()
-    measured = _readings(model, network, record)
+    measured = readings_of(model, network, record)
     if not np.isfinite(measured).any():
         raise TelemetryError(f"{record.name}: holds no reading of {', '.join(model.spec.sensors)}")
     forcing = build_forcing(network, record.take(np.arange(2)), model.max_step_s)
@@ -145,7 +145,7 @@ def assimilate(model: CalibratedModel, record: Record, state: Json | None = None
         If the record lacks an input that the model needs, or holds no reading.
     """
     network = model.network()
-    measured = _readings(model, network, record)
+    measured = readings_of(model, network, record)
     if state is not None:
         measured[0] = np.nan
     elif not np.isfinite(measured).any():
@@ -245,7 +245,7 @@ def _filter(
     )
 
 
-def _readings(model: CalibratedModel, network: Network, record: Record) -> FloatArray:
+def readings_of(model: CalibratedModel, network: Network, record: Record) -> FloatArray:
     """Return the readings with known sensor faults taken off, (n_times, n_sensors)."""
     offset_K = reading_offsets_K(network, network.parameters.values, record.clock_s)
     return measured_temperatures(model.spec, record) - offset_K
