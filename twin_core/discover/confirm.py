@@ -155,6 +155,11 @@ def carried_over(base: Calibration, problem: Problem, effect_values: Mapping[str
     return unknowns
 
 
+def mean_excess(trial: Trial) -> float:
+    """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
+    return float(np.mean(trial.excess()))
+
+
 def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:
     """Return where a richer calibration has each unknown of a simpler problem of the same telemetry, (n_unknowns,)."""
     names = rich.problem.network.parameters.free_names

@@ -13,16 +13,17 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
+from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
+    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_MORE,
+    Finding,
     Judged,
     Search,
     accept,
     examine,
-    mean_excess,
     once_each,
     threshold,
     worth,
@@ -83,10 +84,22 @@ def search(
         prune(state, needed)
     withdraw(state, needed)
     if not state.findings:
+        _name_what_is_nearly_a_law(state)
+        withdraw(state, needed)
+    if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
         withdraw(state, needed)
     return state
+
+
+def _name_what_is_nearly_a_law(state: Search) -> None:
+    """Where nothing else is supported, name the likeliest option that was refused for what little a coarse network leaves."""
+    near = [j for j in state.rejected if j.reason == NEARLY_A_LAW and len(j.trial.effects) == len(j.effects)]
+    if near:
+        best = min(near, key=worth)
+        state.findings, state.trial = [Finding(replace(best, reason=""))], best.trial
+        state.rejected = [j for j in state.rejected if j.effects != best.effects]
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:

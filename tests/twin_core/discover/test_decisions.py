@@ -15,6 +15,7 @@ from twin_core.discover import search as searching
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
     LESS_LIKELY,
+    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
@@ -41,7 +42,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import least_explained, withdraw
+from twin_core.discover.search import _name_what_is_nearly_a_law, least_explained, withdraw
 from twin_core.discover.told import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -302,7 +303,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
     )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
     monkeypatch.setattr(judge, "least_score", lambda *trials: score)
-    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: False)
+    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
     assert judge.examine(simple, option, NEEDED, 100)[0].reason == reason
 
 
@@ -311,6 +312,61 @@ def test_a_correction_is_told_by_its_own_trajectories(
 )
 def test_the_score_asked_for_is_that_of_normal_tables(rate: float, n_tried: int, score: float) -> None:
     assert score_needed(threshold(rate), n_tried) == pytest.approx(score, abs=1e-6)
+
+
+SMALL = REPEATABLE_SHARE * (10.0 - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("beside", "instead", "left", "reason"),
+    [
+        (None, None, 1.0, ""),
+        (SMALL, None, 1.0, NEARLY_A_LAW),
+        (None, SMALL, 1.0, NEARLY_A_LAW),
+        (SMALL + JUST, None, 1.0, NO_LAW),
+        (0.1, SMALL + JUST, 1.0, NO_LAW),
+        (MOST_COARSENESS, None, 9000.0, NEARLY_A_LAW),
+        (MOST_COARSENESS + JUST, None, 9000.0, NO_LAW),
+    ],
+    ids=["a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"],
+)
+def test_what_a_name_leaves_is_weighed_against_what_it_removes(
+    monkeypatch: pytest.MonkeyPatch, beside: float | None, instead: float | None, left: float, reason: str
+) -> None:
+    option = judged("a", 90.0, left=1.0)
+    simple = stub(left=10.0 if left == 1.0 else left)
+    monkeypatch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: beside)
+    monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
+    assert judge._merely_resembles(simple, option, NEEDED) == reason
+
+
+def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
+    """Only one that explains the readings better in its place speaks against it."""
+    lag = REGISTRY["sensor_lag"]({"sensor": "T"}, {"tau_s": 30.0})
+    option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: 1e9)
+        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
+        assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
+        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: 1e9)
+        assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
+
+
+def test_what_is_nearly_a_law_is_named_where_nothing_else_is() -> None:
+    state = Search(stub(), stub())
+    likely, less = (replace(judged(node, nats), reason=NEARLY_A_LAW) for node, nats in (("a", 90.0), ("b", 60.0)))
+    state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
+    _name_what_is_nearly_a_law(state)
+    assert [f.effects[0].where["node"] for f in state.findings] == ["a"] and state.trial is likely.trial
+    assert [j.effects[0].where["node"] for j in state.rejected] == ["c", "b"]
+
+
+def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
+    state = Search(stub(), stub())
+    option = judged("a", 90.0)
+    state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=NEARLY_A_LAW)]
+    _name_what_is_nearly_a_law(state)
+    assert not state.findings
 
 
 @given(st.floats(0.0, 1e6), st.floats(1.0, 2.0), st.integers(10, 10**7))
