@@ -14,6 +14,7 @@ import uvicorn
 
 from service.app import create_app
 from service.http.protocol import patient
+from service.monitoring import tracing
 from service.settings import Settings, unknown_variables
 from service.store.database import Database
 from service.workbench.interface import MakeWorkbench
@@ -57,6 +58,11 @@ def serve(
         from twin_core.effects import load_effects
 
         load_effects(settings.effect_files)  # what is wrong with one is said before anything starts
+    if settings.traces_url:
+        try:
+            tracing.start(settings.traces_url)
+        except ModuleNotFoundError as error:
+            raise ServerError("TWIN_TRACES_URL needs OpenTelemetry: pip install 'thermal-twin[traces]'") from error
     listener = _listen(settings)
     database = Database(settings.database)
     host, port = listener.getsockname()[:2]

@@ -96,6 +96,11 @@ class Settings(BaseSettings):
         le=1e9,
         description="Samples further ahead of this machine's clock go into quarantine; 0: none does.",
     )
+    traces_url: str = Field(
+        "",
+        pattern="^(https?://.+)?$",
+        description="Collector of OpenTelemetry traces, OTLP over HTTP; needs thermal-twin[traces]. Empty: no traces.",
+    )
     log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
 
     @field_validator("database_url")

@@ -19,30 +19,22 @@ from yamcs.client import (
     NotFound,
     ParameterData,
     Unauthorized,
-    ValueUpdate,
     YamcsClient,
     YamcsError,
 )
+from yamcs.protobuf.pvalue.pvalue_service_pb2 import LoadParameterValuesResponse
 
 from replay.bridges.errors import Away, BridgeError
 from replay.bridges.events import Note
-from replay.bridges.instants import to_datetime, to_ms
+from replay.bridges.instants import to_datetime, to_ms, to_text
+from replay.bridges.yamcs_encoding import CHUNK, USABLE, Row, messages, rows_of, updates
 
 for _chatty in ("yamcs-client", "websocket"):
     logging.getLogger(_chatty).setLevel(logging.CRITICAL)  # the bridge tells itself what breaks, once
 TIMEOUT_S = 60.0
 """Longest silence of the server within a request."""
 READINGS = 4
-USABLE = "ACQUIRED"
-"""Status of a value that is a reading; others are invalid, expired or were never received."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """Values of one generation time, in milliseconds, by qualified name."""
-
-    time_ms: int
-    values: Mapping[str, float | str]
+_AS_JSON = {"Accept": "application/json"}
 
 
 @dataclass(frozen=True)
@@ -146,12 +138,10 @@ class YamcsGateway:
         The same rows sent once more are the same values: Yamcs keys them by generation time and by their number within
         the request.
         """
-        batches = (
-            {name: ValueUpdate(value, generation_time=to_datetime(row.time_ms)) for name, value in row.values.items()}
-            for row in rows
-        )
+        url = f"/parameter-values/{self.instance}/streams/{stream}:load"
         with self._told():
-            return int(self._client.load_parameter_values(self.instance, batches, stream=stream).value_count)
+            answer = self._client.ctx.post_proto(url, data=updates(rows))
+            return int(LoadParameterValuesResponse.FromString(answer.content).valueCount)
 
     def history(self, names: Sequence[str], start_ms: int | None, stop_ms: int | None = None) -> Iterator[Row]:
         """Yield the values of start <= generation time < stop from the archive, in the order of time.
@@ -168,10 +158,18 @@ class YamcsGateway:
                     raise
 
     def _read(self, names: Sequence[str], start_ms: int | None, stop_ms: int | None) -> Iterator[Row]:
-        start, stop = (None if t is None else to_datetime(t) for t in (start_ms, stop_ms))
+        span = {"start": start_ms, "stop": stop_ms}
+        question: dict[str, Any] = {"ids": [{"name": name} for name in names]}
+        question |= {key: to_text(time_ms) for key, time_ms in span.items() if time_ms is not None}
+        url = f"/stream-archive/{self.instance}:streamParameterValues"
+        where = f"Yamcs at {self.url}, instance '{self.instance}'"
         with self._told():
-            for data in self._archive.stream_parameter_values(list(names), start=start, stop=stop):
-                yield from _rows(data)
+            answer = self._client.ctx.request("post", url, json=question, headers=dict(_AS_JSON), stream=True)
+            try:
+                for document in messages(answer.iter_content(CHUNK)):
+                    yield from rows_of(document)
+            except ValueError as error:
+                raise Away(f"{where}: an answer broke off") from error
 
     def subscribe(self, names: Sequence[str], take: Callable[[Row], None]) -> Any:
         """Call ``take`` with every new row, from a thread of its own; the answer tells by ``done()`` when it broke off."""

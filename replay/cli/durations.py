@@ -28,14 +28,13 @@ class Duration(click.ParamType):
 
     @staticmethod
     def _parsed(text: str) -> float | None:
+        if re.fullmatch(r"(\d+(\.\d+)?(s|min|m|h|d|w))+", text):
+            parts = re.findall(r"(\d+(?:\.\d+)?)(s|min|m|h|d|w)", text)
+            return sum(float(number) * SECONDS[unit] for number, unit in parts)
         try:
             return float(text)
         except ValueError:
-            pass
-        if not re.fullmatch(r"(\d+(\.\d+)?(s|min|m|h|d|w))+", text):
             return None
-        parts = re.findall(r"(\d+(?:\.\d+)?)(s|min|m|h|d|w)", text)
-        return sum(float(number) * SECONDS[unit] for number, unit in parts)
 
 
 DURATION = Duration()

@@ -15,6 +15,7 @@ import numpy as np
 
 from service.instants import now_us
 from service.live.live import Live
+from service.monitoring import tracing
 from service.monitoring.metrics import Metrics
 from service.store import samples
 from service.store.admission import admit
@@ -52,6 +53,11 @@ class Intake:
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
         batch = replace(batch, received_us=np.full(batch.time_us.size, now_us()))
+        with tracing.part("store", {"thermal_twin.twin": twin.name, "thermal_twin.samples": batch.time_us.size}):
+            tracing.remember(twin.key)
+            return await self._committed(twin, batch)
+
+    async def _committed(self, twin: Entry, batch: Batch) -> Receipt:
         ticket = _Ticket(batch, self._loop.create_future())
         if twin.key not in self._lines:
             self._lines[twin.key] = []

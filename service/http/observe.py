@@ -1,4 +1,4 @@
-"""The layer that counts and times requests."""
+"""The layer that counts, times and traces requests."""
 
 import time
 from functools import cache
@@ -6,6 +6,7 @@ from http import HTTPMethod
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.monitoring import tracing
 from service.monitoring.metrics import Metrics
 
 METHODS = frozenset(HTTPMethod)
@@ -13,7 +14,7 @@ METHODS = frozenset(HTTPMethod)
 
 
 class Observe:
-    """ASGI layer that counts and times every HTTP request by the template of its route."""
+    """ASGI layer that counts, times and traces every HTTP request by the template of its route."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         """Count into ``metrics``."""
@@ -34,10 +35,12 @@ class Observe:
                 status = message["status"]
             await send(message)
 
-        try:
-            await self._app(scope, receive, watched)
-        finally:
-            route = getattr(scope.get("route"), "path", "other")
-            method = scope["method"] if scope["method"] in METHODS else "other"
-            self._requests(method, route, str(status)).inc()
-            self._duration_s(route).observe(time.perf_counter() - started_s)
+        method = scope["method"] if scope["method"] in METHODS else "other"
+        with tracing.request(method, scope["headers"]) as span:
+            try:
+                await self._app(scope, receive, watched)
+            finally:
+                route = getattr(scope.get("route"), "path", "other")
+                tracing.answered(span, method, route, status)
+                self._requests(method, route, str(status)).inc()
+                self._duration_s(route).observe(time.perf_counter() - started_s)

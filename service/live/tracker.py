@@ -14,6 +14,7 @@ from service.live.following import Followed, Following
 from service.live.position import Position, is_far, next_count
 from service.live.progress import Outdated, Reading
 from service.live.scout import Base, Scout
+from service.monitoring import tracing
 from service.monitoring.metrics import Metrics
 from service.store import models
 from service.store.database import Database
@@ -276,7 +277,8 @@ class Tracker:
         if before is None and self.floor_us is not None:
             fresh = await self._following.opened(Samples(fresh.time_us, fresh.values.copy()))
         try:
-            done = await self._following.filter(active, before, fresh)
+            with tracing.part("filter", _told(self.twin, active, fresh), cause=self.twin.key):
+                done = await self._following.filter(active, before, fresh)
         except Exception as error:  # whatever it is, it would come again with the same samples
             self.trouble = str(error) if isinstance(error, TwinError | Refusal) else f"{type(error).__name__}: {error}"
             if caution.failed(fresh.time_us, reading.seq):
@@ -360,3 +362,9 @@ class Tracker:
         self._metrics.assimilated.inc(int(time_us.size))
         self.left = max(self.left - int(time_us.size), 0)
         self._stand(after)
+
+
+def _told(twin: Entry, active: Active, fresh: Samples) -> dict[str, tracing.Value]:
+    """Return what a trace tells of a block that is filtered."""
+    counts = {"thermal_twin.samples": int(fresh.time_us.size), "thermal_twin.model_version": active.version}
+    return {"thermal_twin.twin": twin.name, **counts}

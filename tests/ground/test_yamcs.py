@@ -117,7 +117,7 @@ def until(condition: Callable[[], Any], what: str) -> None:
     raise AssertionError(f"never so: {what}")
 
 
-def once_each(rows: list[tuple[int, Any]], ks: range) -> None:
+def assert_once_each(rows: list[tuple[int, Any]], ks: range) -> None:
     """Check that every generation time of these samples is there, once."""
     assert [time_ms for time_ms, _ in rows] == [T0_MS + k * STEP_MS for k in ks]
 
@@ -143,7 +143,7 @@ def test_telemetry_goes_in_and_what_the_twin_knows_comes_out(
         until(lambda: published(yamcs, "T_px/forecast"), "a forecast is there")
     residuals = client.residuals("benchsat").model_dump()
     rows = published(yamcs, "T_px/residual")
-    once_each(rows, range(230))
+    assert_once_each(rows, range(230))
     np.testing.assert_allclose([value for _, value in rows], residuals["residual_K"]["T_px"])
     np.testing.assert_allclose([v for _, v in published(yamcs, "T_px/residual_sigma")], residuals["std_K"]["T_px"])
     assert {value for _, value in published(yamcs, "model_version")} == {1}
@@ -193,8 +193,8 @@ def test_yamcs_goes_and_comes_back(
         yamcs.start()
         feed(yamcs, 120, 140)
         until(lambda: len(published(yamcs, "nis")) >= 140, "all residuals are there")
-    once_each(published(yamcs, "nis"), range(140))
-    once_each(published(yamcs, "T_px/residual"), range(140))
+    assert_once_each(published(yamcs, "nis"), range(140))
+    assert_once_each(published(yamcs, "T_px/residual"), range(140))
     assert client.twin("benchsat").samples == 140
 
 
@@ -213,7 +213,7 @@ def test_the_service_goes_and_comes_back(
         until(lambda: "SERVICE_AWAY" in [v for _, v in published(yamcs, "health")], "Yamcs hears that the twin is away")
         service.start()
         until(lambda: len(published(yamcs, "nis")) >= 130, "what came meanwhile is fetched and answered")
-    once_each(published(yamcs, "nis"), range(130))
+    assert_once_each(published(yamcs, "nis"), range(130))
     assert service.client().twin("benchsat").samples == 130
 
 
@@ -232,8 +232,8 @@ def test_a_server_that_hangs_gets_nothing_twice(
         feed(yamcs, 90, 100)
         until(lambda: len(published(yamcs, "nis")) >= 100, "all residuals are there")
         until(lambda: bridge.tally.residual_rows >= 40, "the bridge knows")
-    once_each(published(yamcs, "nis"), range(100))
-    once_each(published(yamcs, "T_px/residual"), range(100))
+    assert_once_each(published(yamcs, "nis"), range(100))
+    assert_once_each(published(yamcs, "T_px/residual"), range(100))
 
 
 def test_what_is_dumped_late_fills_the_gap(
@@ -249,7 +249,7 @@ def test_what_is_dumped_late_fills_the_gap(
         feed(yamcs, 60, 100, stream="pp_dump")  # the recorder is read out; the processor never sees this
         until(lambda: client.twin("benchsat").samples == 120, "the gap is filled")
         until(lambda: len(published(yamcs, "nis")) >= 120, "and so are the residuals")
-    once_each(published(yamcs, "nis"), range(120))
+    assert_once_each(published(yamcs, "nis"), range(120))
 
 
 def test_wrong_credentials_are_told_and_right_ones_pass(

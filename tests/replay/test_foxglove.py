@@ -103,7 +103,7 @@ def test_events_are_log_messages_and_intervals_and_no_telemetry(tmp_path: Path) 
 def test_the_schemas_are_those_of_the_sdk() -> None:
     """Field by field, the JSON Schemas are the protocol buffers of Foxglove's SDK; JSON spells time as sec and nsec."""
     foxglove = pytest.importorskip("foxglove.messages")
-    descriptors = pytest.importorskip("google.protobuf.descriptor_pb2")
+    descriptors = pytest.importorskip("yamcs.protobuf._vendor.google.protobuf.descriptor_pb2")
     kinds = {1: "number", 7: "integer", 9: "string", 12: "string", 14: "integer"}
     repeated, message = 3, 11
 
