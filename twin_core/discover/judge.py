@@ -156,7 +156,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
-        examined = state.attempt(partial(examine, state.trial, best, needed, state.n_named), best.labels)
+        examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         refused.append(own)
         if resembles:
@@ -175,14 +175,14 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def examine(simple: Trial, judged: Judged, needed: float, n_tried: int) -> tuple[Judged, bool]:
+def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
 
     A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
     """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
-    if least_score(simple, judged.trial) < score_needed(needed, n_tried):
+    if least_score(simple, judged.trial) < score_needed(needed):
         return replace(judged, reason=SIZE_NOT_TOLD), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):

@@ -84,11 +84,11 @@ def search(
         prune(state, needed)
     withdraw(state, needed)
     if not state.findings:
-        _name_what_is_nearly_a_law(state)
-        withdraw(state, needed)
-    if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
+        withdraw(state, needed)
+    if not state.findings:
+        _name_what_is_nearly_a_law(state)
         withdraw(state, needed)
     return state
 
@@ -276,7 +276,7 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
     if without is None:
         return
     option = replace(finding.judged, trial=state.trial)
-    examined = state.attempt(partial(examine, without[0], option, needed, state.n_named), option.labels)
+    examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
     if examined is not None and examined[0].reason:
         state.rejected.append(examined[0])
         _drop(state, places, *without)

@@ -63,6 +63,9 @@ def _score(rich: Calibration, covariance: FloatArray, without: Problem) -> float
     return float(np.sqrt(squares / variances)) if squares > 0.0 else 0.0
 
 
-def score_needed(needed: float, n_tried: int) -> float:
-    """Return the score that an effect must reach: two-sided at odds of ``needed`` nats for all that were tried (Bonferroni)."""
-    return float(norm.isf(0.5 * np.exp(-needed) / max(n_tried, 1)))
+def score_needed(needed: float) -> float:
+    """Return the score that an effect must reach: two-sided at odds of ``needed`` nats.
+
+    Its evidence has paid for the candidates that were tried; here it is asked whether it has a size.
+    """
+    return float(norm.isf(0.5 * np.exp(-needed)))

@@ -159,7 +159,7 @@ def test_every_set_of_effects_counts_once_at_its_best() -> None:
 def examined(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take the foresight of an option as it stands, and one at node ``form`` for no law."""
 
-    def told(simple: Trial, option: Judged, needed: float, n_tried: int) -> tuple[Judged, bool]:
+    def told(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         assert option.validation is not None
         if not option.validation.foresight < FORESIGHT:
             return replace(option, reason=NO_FORESIGHT), False
@@ -257,7 +257,7 @@ def test_of_effects_found_together_each_must_explain_something(
     monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     asked: list[tuple[Effect, ...]] = []
 
-    def examined(simple: Trial, option: Judged, needed: float, n_tried: int) -> tuple[Judged, bool]:
+    def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         asked.append(option.effects)
         return replace(option, reason=reason), False
 
@@ -283,7 +283,7 @@ def test_beside_a_heat_without_a_name_all_that_stays_counts(
     assert bool(state.findings) == stands
 
 
-SCORE = score_needed(NEEDED, 100)
+SCORE = score_needed(NEEDED)
 
 
 @pytest.mark.parametrize(
@@ -304,14 +304,12 @@ def test_a_correction_is_told_by_its_own_trajectories(
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
     monkeypatch.setattr(judge, "least_score", lambda *trials: score)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
-    assert judge.examine(simple, option, NEEDED, 100)[0].reason == reason
+    assert judge.examine(simple, option, NEEDED)[0].reason == reason
 
 
-@pytest.mark.parametrize(
-    ("rate", "n_tried", "score"), [(0.05, 1, 1.959964), (0.01, 1, 2.575829), (0.01, 100, 3.890592)]
-)
-def test_the_score_asked_for_is_that_of_normal_tables(rate: float, n_tried: int, score: float) -> None:
-    assert score_needed(threshold(rate), n_tried) == pytest.approx(score, abs=1e-6)
+@pytest.mark.parametrize(("rate", "score"), [(0.05, 1.959964), (0.01, 2.575829), (0.001, 3.290527)])
+def test_the_score_asked_for_is_that_of_normal_tables(rate: float, score: float) -> None:
+    assert score_needed(threshold(rate)) == pytest.approx(score, abs=1e-6)
 
 
 SMALL = REPEATABLE_SHARE * (10.0 - 1.0)

@@ -88,4 +88,4 @@ def test_a_load_with_the_period_of_a_declared_input_has_no_size(period_s: float,
     )
     simple, rich = trials(effect, hidden, 3000.0)
     assert rich.fit.log_posterior > simple.fit.log_posterior + 50.0
-    assert (least_score(simple, rich) > score_needed(np.log(100.0), 20)) == is_told
+    assert (least_score(simple, rich) > score_needed(np.log(100.0))) == is_told
