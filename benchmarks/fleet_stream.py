@@ -236,7 +236,7 @@ def main() -> None:
         ["stored; twice; lost", f"{stored:,}; {twice}; {max(acknowledged - stored, 0)}"],
         ["followed by the filter", f"{followed:,}, all of it {wait_s:.1f} s after the last sample at most"],
         ["mean NIS over its expectation", f"{nis:.3f}"],
-        ["ingest, request to answer", quantiles(told.latency_s, "ms", 1e3)],
+        ["ingest until the answer, waiting for one of 8 lanes included", quantiles(told.latency_s, "ms", 1e3)],
         ["forecasts, request to answer", f"{len(told.forecast_s):,}: {quantiles(told.forecast_s, 'ms', 1e3)}"],
         ["state behind the newest acknowledged sample", quantiles(told.behind_s, "s")],
         ["processor time per sample: services, database", f"{each * own:.1f} ms, {each * database_s:.1f} ms"],
