@@ -8,7 +8,7 @@ GROUND := $(VENV)/.ground
 DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-ground test-fleet check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
+.PHONY: demo test test-fast test-ground test-fleet test-postgres check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -43,9 +43,12 @@ test: $(STAMP)
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow and not e2e and not browser and not ground and not fleet"
 
-# On PostgreSQL: several processes and their faults, then every test of the service that starts no process of its own.
+# Several processes on PostgreSQL, and their faults.
 test-fleet: $(STAMP)
 	TWIN_TEST_STORE=postgres $(BIN)/pytest -m fleet tests/service/fleet
+
+# On PostgreSQL every test of the service that starts no process of its own.
+test-postgres: $(STAMP)
 	TWIN_TEST_STORE=postgres $(PYTEST) -m "not fleet and not e2e and not browser and not ground" tests/service
 
 check: $(STAMP)

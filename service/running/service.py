@@ -37,6 +37,7 @@ class Service:
     housekeeping: Housekeeping
     ownership: Ownership
     _coming_and_going: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _leaving: set[int] = field(default_factory=set)
 
     def add_twin(self, twin: Twin, spec: TwinSpec | None = None) -> Entry:
         """Let a stored twin take part in everything; its specification need not be checked again where it just was."""
@@ -60,7 +61,9 @@ class Service:
             return self.add_twin(await self.database.read(twins.get, name))
 
     async def find_key(self, key: int) -> Entry | None:
-        """Return a twin by its number, None if it is gone."""
+        """Return a twin by its number, None if it is gone, or going: who deletes it waits for its jobs."""
+        if key in self._leaving:
+            return None
         known = next((entry for entry in self.registry if entry.key == key), None)
         if known is None and self.database.is_shared:
             found = await self.database.read(ownership.changes, [key])
@@ -116,8 +119,12 @@ class Service:
             if self.registry.get(twin.name) is not twin:
                 raise TwinGone(f"twin {twin.key} is gone")
             self.registry.remove(twin.name)
-            await self.jobs.cancel_twin(twin)
-            await self.live.remove(twin)
-            await self.database.write_to(twin.key, twins.delete, twin.name)
+            self._leaving.add(twin.key)
+            try:
+                await self.jobs.cancel_twin(twin)
+                await self.live.remove(twin)
+                await self.database.write_to(twin.key, twins.delete, twin.name)
+            finally:
+                self._leaving.discard(twin.key)
             self.hub.close(twin.key)
             self.housekeeping.wake()
