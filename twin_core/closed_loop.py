@@ -1,7 +1,7 @@
 """The closed loop: calibrate, find what is missing, add it, and measure on telemetry that no choice has seen."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,6 +20,7 @@ from twin_core.discover.judge import NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
+from twin_core.effects.base import Effect
 from twin_core.errors import TelemetryError
 from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
@@ -65,6 +66,7 @@ def close_loop(
     burn_in_s: float | None = None,
     false_alarm_rate: float = 0.01,
     deadline_s: float | None = None,
+    first: Collection[Effect] = (),
     progress: Progress = no_progress,
 ) -> ClosedLoop:
     """Close the loop on telemetry.
@@ -85,6 +87,8 @@ def close_loop(
         Tolerated rate of findings on healthy records, between 0 and 1.
     deadline_s
         Seconds after which the search ends with the best answer so far; none by default.
+    first
+        Effects that spacecraft of the same design have: at their places they are tried wherever they could matter.
     progress
         Called with the fraction done; may raise to cancel.
 
@@ -106,7 +110,17 @@ def close_loop(
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
         return _close_loop(
-            spec, records, holdout, holdout_records, burn_in_s, false_alarm_rate, deadline, latest, begun, progress
+            spec,
+            records,
+            holdout,
+            holdout_records,
+            burn_in_s,
+            false_alarm_rate,
+            deadline,
+            latest,
+            begun,
+            first,
+            progress,
         )
 
 
@@ -120,6 +134,7 @@ def _close_loop(
     deadline: float,
     latest: float,
     begun: float,
+    first: Collection[Effect],
     progress: Progress,
 ) -> ClosedLoop:
     """Close the loop on checked arguments.
@@ -138,6 +153,7 @@ def _close_loop(
         base,
         false_alarm_rate=false_alarm_rate,
         deadline=deadline,
+        first={effect.place for effect in first},
         progress=lambda f, m: progress(0.35 + 0.5 * f, m),
     )
     found.every = every
