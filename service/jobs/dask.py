@@ -4,12 +4,11 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed
+from service.jobs.executor import Cancel, ExecutorLost, JobFailed, Tasks
 from twin_core.errors import TwinError
 
 T = TypeVar("T")
@@ -20,32 +19,19 @@ AWAY_S = 15.0
 CONNECT_S = 10.0
 
 
-class DaskTasks:
+class DaskTasks(Tasks):
     """Runs ``function(*args, progress=...)`` on the workers of a Dask scheduler, at most so many at a time."""
 
     def __init__(self, address: str, max_workers: int, deadline_s: float) -> None:
         """Connect with the first task; one that runs longer than ``deadline_s`` is ended."""
-        self._address, self._deadline_s = address, deadline_s
-        self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix="dask")
-        self._closing = Cancel()
+        super().__init__(max_workers, deadline_s, "dask")
+        self._address = address
         self._lock = threading.Lock()
         self._client: Client | None = None
 
-    def start(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> "Future[T]":
-        """Queue a task; ``progress`` is called in a thread of this process."""
-        return self._threads.submit(self._supervise, (function, args, kwargs), progress, cancel)
-
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End every task and let go of the cluster."""
-        self._closing.request()
-        self._threads.shutdown(wait=wait, cancel_futures=True)
+        super().shutdown(wait, cancel_futures=cancel_futures)
         with self._lock:
             if self._client is not None:
                 self._client.close(timeout=2)
@@ -59,19 +45,23 @@ class DaskTasks:
                     raise ExecutorLost(f"no scheduler answers at {self._address}") from error
             return self._client
 
-    def _supervise(self, call: tuple[Any, ...], progress: Callable[[float, str], None], cancel: Cancel) -> Any:
+    def _supervise(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> T:
         client = self._connected()
         topic = f"twin-{uuid.uuid4().hex}"
-        future = client.get_executor(pure=False, retries=2).submit(_run, topic, *call)
+        future = client.get_executor(pure=False, retries=2).submit(_run, topic, function, args, kwargs)
         client.subscribe_topic(topic, lambda event: progress(*event[1]))
-        deadline_s = time.monotonic() + self._deadline_s
+        until_s = time.monotonic() + self._deadline_s
         seen_s = time.monotonic()
         try:
             while not future.done():
-                if cancel.requested or self._closing.requested:
-                    raise JobCancelled
-                if time.monotonic() > deadline_s:
-                    raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+                self._raise_if_over(until_s, cancel)
                 if client.status == "running":
                     seen_s = time.monotonic()
                 elif time.monotonic() - seen_s > AWAY_S:
@@ -86,7 +76,8 @@ class DaskTasks:
             future.cancel()
         if kind == "failed":
             raise JobFailed(*rest)
-        return rest[0]
+        done: T = rest[0]
+        return done
 
 
 def _run(topic: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:

@@ -14,12 +14,13 @@ import re
 import signal
 import time
 import traceback
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, ParamSpec, Protocol, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from twin_core.errors import TwinError
 
@@ -66,37 +67,15 @@ class Cancel:
         return self._event.is_set()
 
 
-class Tasks(Protocol):
-    """What computes tasks, here or elsewhere."""
+class Tasks(ABC):
+    """What computes tasks, here or elsewhere: a thread watches each, so many at a time."""
 
-    def start(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> "Future[T]":
-        """Queue ``function(*args, progress=..., **kwargs)``; JobFailed, JobCancelled or ExecutorLost say how else it ended."""
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End every task."""
-
-
-class ProcessPerTask(Executor):
-    """Runs ``function(*args, progress=...)`` in a fresh spawned process per task, at most ``max_workers`` at a time."""
-
-    def __init__(self, max_workers: int, deadline_s: float, memory_MiB: float = math.inf) -> None:
-        """Tasks that run longer than ``deadline_s`` or need more than ``memory_MiB`` are ended."""
-        self._memory_MiB = memory_MiB
-        self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix="job")
+    def __init__(self, max_workers: int, deadline_s: float, threads: str) -> None:
+        """Tasks that run longer than ``deadline_s`` are ended; ``threads`` is what the watching threads are called."""
+        self._threads = ThreadPoolExecutor(max_workers, thread_name_prefix=threads)
         self._deadline_s = deadline_s
         self._closing = Cancel()
 
-    def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
-        """Queue a task without progress and without a way to end it early."""
-        return self.start(function, args, kwargs, lambda fraction, message: None, Cancel())
-
     def start(
         self,
         function: Callable[..., T],
@@ -105,27 +84,65 @@ class ProcessPerTask(Executor):
         progress: Callable[[float, str], None],
         cancel: Cancel,
     ) -> "Future[T]":
-        """Queue a task; ``progress`` is called in a thread of this process."""
-        call = (f"{function.__module__}:{function.__qualname__}", args, kwargs)
-        return self._threads.submit(self._supervise, call, progress, cancel)
+        """Queue ``function(*args, progress=..., **kwargs)``; ``progress`` is called in a thread of this process.
+
+        JobFailed, JobCancelled or ExecutorLost say how else it ended.
+        """
+        return self._threads.submit(self._supervise, function, args, kwargs, progress, cancel)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """End every task."""
         self._closing.request()
         self._threads.shutdown(wait=wait, cancel_futures=True)
 
-    def _supervise(self, call: tuple[str, Any, Any], progress: Callable[[float, str], None], cancel: Cancel) -> Any:
+    def _raise_if_over(self, until_s: float, cancel: Cancel) -> None:
+        """Raise what ends a task that is no longer wanted, or has taken too long."""
+        if cancel.requested or self._closing.requested:
+            raise JobCancelled
+        if time.monotonic() > until_s:
+            raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+
+    @abstractmethod
+    def _supervise(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> T:
+        """Have a task computed, and return what came of it."""
+
+
+class ProcessPerTask(Tasks, Executor):
+    """Runs ``function(*args, progress=...)`` in a fresh spawned process per task, at most ``max_workers`` at a time."""
+
+    def __init__(self, max_workers: int, deadline_s: float, memory_MiB: float = math.inf) -> None:
+        """Tasks that run longer than ``deadline_s`` or need more than ``memory_MiB`` are ended."""
+        super().__init__(max_workers, deadline_s, "job")
+        self._memory_MiB = memory_MiB
+
+    def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
+        """Queue a task without progress and without a way to end it early."""
+        return self.start(function, args, kwargs, lambda fraction, message: None, Cancel())
+
+    def _supervise(
+        self,
+        function: Callable[..., T],
+        args: tuple[Any, ...],
+        kwargs: dict[str, Any],
+        progress: Callable[[float, str], None],
+        cancel: Cancel,
+    ) -> T:
+        name = f"{function.__module__}:{function.__qualname__}"
         ours, theirs = _CONTEXT.Pipe()
-        process = _CONTEXT.Process(target=_run, args=(theirs, *call), daemon=True)
+        process = _CONTEXT.Process(target=_run, args=(theirs, name, args, kwargs), daemon=True)
         process.start()
         theirs.close()
-        deadline_s = time.monotonic() + self._deadline_s
+        until_s = time.monotonic() + self._deadline_s
         try:
             while True:
-                if cancel.requested or self._closing.requested:
-                    raise JobCancelled
-                if time.monotonic() > deadline_s:
-                    raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
+                self._raise_if_over(until_s, cancel)
                 if resident_MiB(process.pid or 0) > self._memory_MiB:
                     raise JobFailed(
                         f"ended: it needed more than {self._memory_MiB:g} MiB of memory (TWIN_JOB_MEMORY_MIB); "
@@ -139,7 +156,8 @@ class ProcessPerTask(Executor):
                 elif kind == "failed":
                     raise JobFailed(*rest)
                 else:
-                    return rest[0]
+                    done: T = rest[0]
+                    return done
         finally:
             _end(process)
             ours.close()

@@ -123,20 +123,22 @@ class Browser:
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
 
     def click(self, selector: str) -> None:
-        """Click in the middle of an element with a real mouse event."""
+        """Click in the middle of an element with a real mouse event; again if the page moved it away just then."""
         found = f"document.querySelector({json.dumps(selector)})"
         self.until(found)
-        place = None
-        for _ in range(50):  # until it rests: what is loaded above it may move it
+        for _ in range(50):
             self.evaluate(f"{found}.scrollIntoView({{block: 'center'}})")
-            before, place = place, self.box(selector)
-            if before == place:
-                break
+            self.evaluate(
+                "window.hit = false; document.addEventListener('click', (e) => "
+                f"{{ window.hit ||= Boolean(e.target.closest({json.dumps(selector)})); }}, {{once: true, capture: true}})"
+            )
+            x, y, width, height = self.box(selector)
+            for kind in ("mousePressed", "mouseReleased"):
+                self.mouse(kind, x + width / 2, y + height / 2, button="left", clickCount=1)
+            if self.evaluate("window.hit"):
+                return
             time.sleep(0.1)
-        assert place is not None
-        x, y, width, height = place
-        for kind in ("mousePressed", "mouseReleased"):
-            self.mouse(kind, x + width / 2, y + height / 2, button="left", clickCount=1)
+        raise AssertionError(f"{selector} cannot be clicked")
 
     def drag(self, selector: str, start: float, stop: float) -> None:
         """Drag over an element, between two shares of its width."""

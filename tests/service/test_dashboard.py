@@ -148,10 +148,10 @@ def test_inputs_limits_plans_and_files(server: Server, page: Browser) -> None:
     page.click("#what-if")
     page.until("document.getElementById('plan-dialog').open")
     page.evaluate("document.querySelector('#plan-rows input[type=number]').value = '7'")
-    page.evaluate("document.querySelector('#plan-rows input[type=datetime-local]').value = '2030-01-01T00:00'")
+    page.evaluate("document.querySelector('#plan-rows input.instant').value = '2030-01-01T00:00'")
     page.click("#plan-show")
     page.until("!document.getElementById('plan-refused').hidden")  # the plan begins after the forecast ends
-    page.evaluate("document.querySelector('#plan-rows input[type=datetime-local]').value = '1970-01-01T04:00'")
+    page.evaluate("document.querySelector('#plan-rows input.instant').value = '1970-01-01T04:00'")
     page.click("#plan-show")
     page.until("!document.getElementById('plan-dialog').open")
     page.until("document.getElementById('plot-note').innerText.includes('with your plan')")
@@ -181,10 +181,13 @@ def test_a_time_is_entered_and_the_address_keeps_it(server: Server, page: Browse
     page.open("about:blank")
     page.open(address)
     page.until("document.getElementById('plot-note').innerText.startsWith('31 samples')")
-    assert page.evaluate("document.getElementById('to').value") in ("1970-01-01T01:30:00", "1970-01-01T01:30")
+    assert page.evaluate("document.getElementById('to').value") == "1970-01-01 01:30:00"
     page.evaluate("document.getElementById('to').value = '1970-01-01T00:30:00'")
     page.click("#times button")
     page.until("document.getElementById('toasts').innerText.includes('must come before')")
+    page.evaluate("document.getElementById('to').value = '1/1/1970, 2 PM'")
+    page.click("#times button")
+    page.until("document.getElementById('toasts').innerText.includes('Write both times as')")
     assert page.troubles == []
 
 

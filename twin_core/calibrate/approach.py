@@ -25,8 +25,9 @@ MAX_ROUNDS, SETTLED = 6, 0.9
 MAX_ITERATIONS, TOLERANCE = 20, 1e-3
 """Of the search within a round: neighbouring samples share their misfit, so that a cost that falls by less tells nothing."""
 
-COARSE_SAMPLES = 1200
-"""Records longer than twice this are thinned to about this many samples for a first approach."""
+COARSE_SAMPLES, COARSE_READINGS, LEAST_COARSE = 1200, 30_000, 200
+"""Records longer than twice this are thinned to about this many samples for a first approach; where sensors are many, to
+samples of about so many readings, but no fewer than the last number."""
 
 
 def misfit_K(problem: Problem, fit: Fit) -> float:
@@ -95,9 +96,14 @@ def approach(
     return replace(best, iterations=iterations)
 
 
-def coarse_problem(problem: Problem, step_s: float, n_samples: int = COARSE_SAMPLES) -> Problem:
-    """Return a problem on records thinned to ``n_samples`` at least, with longer steps; itself where records are short."""
+def coarse_problem(problem: Problem, step_s: float, n_samples: int | None = None) -> Problem:
+    """Return a problem on records thinned to ``n_samples`` at least, with longer steps; itself where records are short.
+
+    By default as many as a first approach needs.
+    """
     records = [segment.record for segment in problem.segments]
+    if n_samples is None:
+        n_samples = int(np.clip(COARSE_READINGS // problem.noise_K.size, LEAST_COARSE, COARSE_SAMPLES))
     stride = sum(r.time_s.size for r in records) // n_samples
     if stride < 2 or min(r.time_s.size for r in records) < 10 * stride:
         return problem

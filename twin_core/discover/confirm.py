@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import chi2
 
-from twin_core._typing import BoolArray, FloatArray
+from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
@@ -153,6 +153,27 @@ def carried_over(base: Calibration, problem: Problem, effect_values: Mapping[str
     for i in range(len(problem.segments)):
         unknowns[problem.start_columns(i)] = base.optimum.unknowns[base.problem.start_columns(i)][source]
     return unknowns
+
+
+def mean_excess(trial: Trial) -> float:
+    """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
+    return float(np.mean(trial.excess()))
+
+
+def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:
+    """Return where a richer calibration has each unknown of a simpler problem of the same telemetry, (n_unknowns,)."""
+    names = rich.problem.network.parameters.free_names
+    own = [names.index(name) for name in problem.network.parameters.free_names]
+    source = [rich.problem.network.nodes.index(node) for node in problem.network.nodes]
+    starts = [
+        np.arange(rich.problem.n_unknowns)[rich.problem.start_columns(i)][source] for i in range(len(problem.segments))
+    ]
+    return np.concatenate([np.array(own, dtype=np.int64), *starts])
+
+
+def reduced(rich: Calibration, problem: Problem) -> FloatArray:
+    """Return the unknowns of a simpler problem at a richer calibration's values."""
+    return rich.optimum.unknowns[shared_unknowns(rich, problem)]
 
 
 def fitted_effects(effects: Sequence[Effect], values: dict[str, float]) -> tuple[Effect, ...]:

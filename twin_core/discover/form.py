@@ -5,15 +5,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin_core.discover.confirm import Trial, try_effects, weigh
+from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
 
 N_REFITS, N_RIVALS = 6, 2
 
 
-def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> bool:
-    """Return whether a free form of temperature is supported on top of named effects, at the nodes where they act.
+def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> float | None:
+    """Return what a free form of temperature removes on top of named effects, at the nodes where they act, if it is supported.
 
     A law that merely resembles what is missing leaves the difference behind: not noise, not a wandering heat, but one
     that comes back with the temperature. Then the heat is repeatable and the name is not.
@@ -28,14 +28,22 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
         Log Bayes factor from which a free form is worth a refit.
     most
         Log Bayes factor up to which what is left does not count.
+
+    Returns
+    -------
+    float, or None
+        Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
     best, n_tried = _free_forms(trial, effects, needed)
     tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
-    return any(weigh(trial, top, n_tried).log_bayes_factor > most for top in _likeliest(trial, tops))
+    supported = [top for top in _likeliest(trial, tops) if weigh(trial, top, n_tried).log_bayes_factor > most]
+    return max((mean_excess(trial) - mean_excess(top) for top in supported), default=None)
 
 
-def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> bool:
-    """Return whether a free form of temperature in the place of named effects is far likelier than they are.
+def outdone_by_a_free_form(
+    simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float
+) -> float | None:
+    """Return what a free form of temperature removes more than named effects in whose place it is, if it is far likelier.
 
     Where the heat visits one flank of a curve, another law with a kink or two comes near all of it: what is left then is
     small beside the heat, but the free form needs none of it.
@@ -45,11 +53,12 @@ def outdone_by_a_free_form(simple: Trial, trial: Trial, effects: Sequence[Effect
     simple
         Without the effects.
     trial, effects, needed, most
-        As in :func:`leaves_a_repeatable_heat`.
+        As in :func:`leaves_a_repeatable_heat`, and what is returned as well.
     """
     best, _ = _free_forms(simple, effects, needed)
     instead = [try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS]]
-    return any(weigh(rival, trial, 1).log_bayes_factor < -most for rival in _likeliest(simple, instead))
+    likelier = [rival for rival in _likeliest(simple, instead) if weigh(rival, trial, 1).log_bayes_factor < -most]
+    return max((mean_excess(trial) - mean_excess(rival) for rival in likelier), default=None)
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:

@@ -11,8 +11,9 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
-from twin_core.discover.confirm import Evidence, Trial, Validation, validate
+from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
+from twin_core.discover.told import least_score, score_needed
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError
 from twin_core.simulate.rollout import hurried
@@ -24,11 +25,13 @@ N_VALIDATED, N_VALIDATED_FREE = 3, 8
 
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+SIZE_NOT_TOLD = "the record does not tell its size: other parameters of the model make up for it"
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
+NEARLY_A_LAW = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
 
 
 @dataclass(frozen=True)
@@ -153,10 +156,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
         if best.evidence.log_bayes_factor <= needed:
             continue
-        examined = state.attempt(partial(_examined, state.trial, best, needed), best.labels)
+        examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         refused.append(own)
-        if own.reason == NO_LAW and resembles:
+        if resembles:
             break  # what explains less is no better a name for this heat
         if own.validation is not None and not own.reason:
             refused.pop()
@@ -172,39 +175,45 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def _examined(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
+def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
 
     A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
     """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
+    if least_score(simple, judged.trial) < score_needed(needed):
+        return replace(judged, reason=SIZE_NOT_TOLD), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
-    resembles = _merely_resembles(simple, judged, needed)
-    return replace(judged, validation=validation, reason=NO_LAW if resembles else ""), resembles
+    reason = _merely_resembles(simple, judged, needed)
+    return replace(judged, validation=validation, reason=reason), bool(reason)
 
 
-def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> bool:
-    """Return whether named effects are not the law of the heat that they stand for; a free form claims no law."""
+def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
+    """Return why named effects are not the law of the heat that they stand for, if they are not; a free form claims no law.
+
+    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better.
+    """
     named = [effect for effect in judged.effects if not effect.fallback]
     if not named:
-        return False
+        return ""
+    heats = [effect for effect in named if "sensor" not in effect.where]
     most = most_left(judged.evidence.log_bayes_factor, needed)
     with ThreadPoolExecutor(1) as pool:  # side by side, under the same deadline
         other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, judged.trial, named, needed, most)
-        return leaves_a_repeatable_heat(judged.trial, named, needed, most) or other.result()
+        beside = leaves_a_repeatable_heat(judged.trial, heats, needed, most) if heats else None
+    left = [removed for removed in (beside, other.result()) if removed is not None]
+    if not left:
+        return ""
+    little = policy.REPEATABLE_SHARE * (mean_excess(simple) - mean_excess(judged.trial))
+    return NEARLY_A_LAW if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:
     """Return how much evidence a repeatable heat beside a name may have, given that of the name."""
     return max(needed, policy.REPEATABLE_SHARE * log_bayes_factor)
-
-
-def mean_excess(trial: Trial) -> float:
-    """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
-    return float(np.mean(trial.excess()))
 
 
 def once_each(options: Sequence[Judged]) -> list[Judged]:

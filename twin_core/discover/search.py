@@ -13,15 +13,17 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial, resettled, try_effects, weigh
+from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
+    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_MORE,
+    Finding,
     Judged,
     Search,
     accept,
-    mean_excess,
+    examine,
     once_each,
     threshold,
     worth,
@@ -80,12 +82,24 @@ def search(
         if not _extend(state, needed, fallback=False):
             break
         prune(state, needed)
-    withdraw(state)
+    withdraw(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
-        withdraw(state)
+        withdraw(state, needed)
+    if not state.findings:
+        _name_what_is_nearly_a_law(state)
+        withdraw(state, needed)
     return state
+
+
+def _name_what_is_nearly_a_law(state: Search) -> None:
+    """Where nothing else is supported, name the likeliest option that was refused for what little a coarse network leaves."""
+    near = [j for j in state.rejected if j.reason == NEARLY_A_LAW and len(j.trial.effects) == len(j.effects)]
+    if near:
+        best = min(near, key=worth)
+        state.findings, state.trial = [Finding(replace(best, reason=""))], best.trial
+        state.rejected = [j for j in state.rejected if j.effects != best.effects]
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
@@ -220,12 +234,12 @@ def _judge(
     return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)
 
 
-def withdraw(state: Search) -> None:
+def withdraw(state: Search, needed: float) -> None:
     """Withdraw what explains no more than a lumped network may leave: both may be its coarseness.
 
     A finding must explain more than what stays beside it, and each of its effects more than any coarse network may have left.
     Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
-    counts as unexplained, unless the others explain it too.
+    counts as unexplained, unless the others explain it too; what is left of a set that lost a member is examined as any option.
     """
     while state.findings:
         left, n_readings = mean_excess(state.trial), state.trial.n_samples
@@ -248,7 +262,24 @@ def withdraw(state: Search) -> None:
                 state.rejected.append(replace(finding.judged, effects=effects, reason=NO_MORE))
         kept = without[weakest]
         assert kept is not None
+        torn = [f for f in state.findings if any(e.place in weakest for e in f.effects)]
+        rests = [{e.place for e in f.effects} - weakest for f in torn]
         _drop(state, weakest, *kept)
+        for rest in filter(None, rests):
+            _examine_again(state, rest, needed)
+
+
+def _examine_again(state: Search, places: Collection[object], needed: float) -> None:
+    """Withdraw the finding at places if by itself it does not pass what any option must."""
+    without = _attempted_without(state, places)
+    finding = next(f for f in state.findings if {effect.place for effect in f.effects} == places)
+    if without is None:
+        return
+    option = replace(finding.judged, trial=state.trial)
+    examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
+    if examined is not None and examined[0].reason:
+        state.rejected.append(examined[0])
+        _drop(state, places, *without)
 
 
 def by_chance(n_readings: int) -> float:

@@ -1,6 +1,6 @@
 """The twin specification: what the operator declares, and whether it fits together."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Literal, Self
@@ -9,8 +9,8 @@ from pydantic import AfterValidator, Field, StrictBool, field_validator, model_v
 from pydantic_core import PydanticCustomError
 
 from twin_core.errors import TelemetryError
-from twin_core.network.formula import channels_of, parse
-from twin_core.network.orbit_block import PREFIX, OrbitBlock
+from twin_core.network.formula import parse
+from twin_core.network.orbit_block import OrbitBlock
 from twin_core.network.quantities import (
     TWIN_ID,
     Conductance,
@@ -26,6 +26,7 @@ from twin_core.network.quantities import (
     Temperature,
     Tied,
 )
+from twin_core.network.references import broken_references
 from twin_core.units import parse_instant_ns
 
 REFERENCES = "references"
@@ -365,83 +366,10 @@ class TwinSpec(Strict):
 
     @model_validator(mode="after")
     def _names_resolve(self) -> Self:
-        problems = list(dict.fromkeys(self._problems()))
+        problems = list(dict.fromkeys(broken_references(self)))
         if problems:
             raise PydanticCustomError(REFERENCES, "references", {"problems": problems})
         return self
-
-    def _problems(self) -> Iterable[str]:
-        """Yield every broken reference; the first becomes the headline."""
-        nodes = [node.id for node in self.nodes]
-        yield from (f"nodes[{i}].id: '{n}' is declared twice" for i, n in enumerate(nodes) if n in nodes[:i])
-        yield from (f"boundaries.{name}: a node has the same id" for name in self.boundaries if name in nodes)
-        for name, boundary in self.boundaries.items():
-            if boundary.channel is not None:
-                yield from self._check_channel(f"boundaries.{name}.channel", boundary.channel, ("temperature",))
-        seen: dict[str, str] = {}
-        for i, node in enumerate(self.nodes):
-            for sensor in node.sensors:
-                yield from self._check_channel(f"nodes[{i}].sensor", sensor, ("temperature",))
-                if sensor in seen:
-                    yield f"nodes[{i}].sensor: '{sensor}' already reads node '{seen[sensor]}'"
-                seen[sensor] = node.id
-        for name, boundary in self.boundaries.items():
-            if boundary.channel in seen:
-                yield f"boundaries.{name}.channel: '{boundary.channel}' reads node '{seen[boundary.channel]}'; one of both"
-        if not seen:
-            yield "nodes: none has a sensor; name the temperature channel of at least one node"
-        yield from self._check_conductors(nodes)
-        yield from self._check_unseen()
-        for i, radiator in enumerate(self.radiators):
-            yield from self._check_end(f"radiators[{i}].node", radiator.node, nodes)
-            yield from self._check_end(f"radiators[{i}].sink", radiator.sink, list(self.boundaries), "boundary")
-            if (radiator.node, radiator.sink) in [(r.node, r.sink) for r in self.radiators[:i]]:
-                yield f"radiators[{i}]: '{radiator.node}' radiates to '{radiator.sink}' twice; add the areas"
-        yield from self._check_orbit()
-        yield from self._check_radiation(nodes)
-        yield from self._check_heaters(nodes)
-        yield from self._check_derived()
-        yield from self._check_loads(nodes)
-        yield from self._check_shared()
-        for sensor in self.criteria.per_sensor:
-            if sensor not in seen:
-                yield f"criteria.per_sensor.{sensor}: reads no node (sensors: {', '.join(seen) or 'none'})"
-
-    def _check_unseen(self) -> Iterable[str]:
-        """Refuse hidden nodes that are joined with one another and with no node that is read: no data tell anything of them.
-
-        A single one may yet be joined by what the closed loop finds; it is told among the doubts. Nodes whose capacities are
-        known, those of an imported deck, say, need no data.
-        """
-        groups = {node.id: {node.id} for node in self.nodes}
-        for first, second in [*(c.between for c in self.conductors), *(r.between for r in self.radiation)]:
-            one, other = groups.get(first), groups.get(second)
-            if one is not None and other is not None and one is not other:
-                one |= other
-                groups |= dict.fromkeys(other, one)
-        read = {node.id for node in self.nodes if node.sensors}
-        known = {n.id for n in self.nodes if n.capacity_J_per_K is not None and n.capacity_J_per_K.value is not None}
-        for group in {id(group): group for group in groups.values()}.values():
-            if len(group) > 1 and not group & read and not group <= known:
-                names = ", ".join(sorted(group)[:5]) + (f" and {len(group) - 5} more" if len(group) > 5 else "")
-                yield f"nodes: no sensor sees {names}: join one of them to a node with a sensor, or remove them"
-
-    def _check_shared(self) -> Iterable[str]:
-        """Check the shared unknowns: each is used, by quantities of one kind, and has a size to start from."""
-        used: dict[str, str] = {}
-        for field, tie, unit in self.ties:
-            if tie[0] not in self.parameters:
-                known = ", ".join(self.parameters) or "none"
-                yield f"{field}: unknown parameter '{tie[0]}'; declare it under parameters (known: {known})"
-            elif used.setdefault(tie[0], unit) != unit:
-                yield f"{field}: '{tie[0]}' is in {used[tie[0]]} elsewhere and would be in {unit} here; give it another name"
-        for name, quantity in self.parameters.items():
-            if ":" in name or "." in name:
-                yield f"parameters.{name}: a shared unknown has neither ':' nor '.' in its name"
-            if quantity.guess is None and quantity.value is None:
-                yield f"parameters.{name}: give a 'guess' that is calibrated, or a 'value' that is held"
-            if name not in used:
-                yield f"parameters.{name}: is used nowhere; name it as 'per_area', 'per_mass' or 'scale', or remove it"
 
     @property
     def ties(self) -> list[tuple[str, tuple[str, float], str]]:
@@ -456,116 +384,6 @@ class TwinSpec(Strict):
             for field, tied in where
             if tied is not None and tied.tie is not None
         ]
-
-    def _check_orbit(self) -> Iterable[str]:
-        for name in () if self.orbit is None else self.orbit.units:
-            if name in self.channels:
-                yield f"channels.{name}: comes from the orbit; remove it, or declare no orbit"
-        for name in self.attitude_channels:
-            yield from self._check_channel("orbit.attitude.quaternion_channels", name, ("auxiliary",))
-            if name in self.channels and self.channels[name].levels:
-                yield f"orbit.attitude.quaternion_channels: channel '{name}' has levels; a quaternion has none"
-
-    def _check_conductors(self, nodes: list[str]) -> Iterable[str]:
-        pairs: set[tuple[frozenset[str], str | None]] = set()
-        joined: set[frozenset[str]] = set()
-        for i, conductor in enumerate(self.conductors):
-            ends = frozenset(conductor.between)
-            for end in conductor.between:
-                yield from self._check_end(
-                    f"conductors[{i}].between", end, [*nodes, *self.boundaries], "node or boundary"
-                )
-            if ends <= set(self.boundaries):
-                yield f"conductors[{i}].between: joins two boundaries; one end must be a node"
-            if conductor.into in self.boundaries:
-                yield f"conductors[{i}].into: '{conductor.into}' is a boundary, which nothing heats; name the node"
-            if (ends, conductor.into) in pairs or (
-                ((ends, None) in pairs or conductor.into is None) and ends in joined
-            ):
-                yield f"conductors[{i}].between: {' and '.join(conductor.between)} are joined twice; add the conductances"
-            pairs.add((ends, conductor.into))
-            joined.add(ends)
-
-    def _check_radiation(self, nodes: list[str]) -> Iterable[str]:
-        seen = {frozenset((r.node, r.sink)) for r in self.radiators}
-        for i, coupling in enumerate(self.radiation):
-            for end in coupling.between:
-                yield from self._check_end(
-                    f"radiation[{i}].between", end, [*nodes, *self.boundaries], "node or boundary"
-                )
-            ends = frozenset(coupling.between)
-            if ends <= set(self.boundaries):
-                yield f"radiation[{i}].between: joins two boundaries; one end must be a node"
-            if ends in seen:
-                yield f"radiation[{i}].between: {' and '.join(coupling.between)} radiate twice; add the areas"
-            seen.add(ends)
-
-    def _check_heaters(self, nodes: list[str]) -> Iterable[str]:
-        names = [heater.name for heater in self.heaters]
-        for i, heater in enumerate(self.heaters):
-            yield from self._check_end(f"heaters[{i}].node", heater.node, nodes)
-            yield from self._check_end(f"heaters[{i}].control", heater.controlled_by, nodes)
-            if heater.thermostat is not None and heater.controlled_by != heater.node:
-                yield (
-                    f"heaters[{i}].control: a thermostat is switched by the node that it heats; leave 'control' out, or use"
-                    " 'proportional', which may read another node"
-                )
-            if heater.name in names[:i]:
-                yield f"heaters[{i}]: node '{heater.node}' has another heater with the same control; add the powers"
-
-    def _check_derived(self) -> Iterable[str]:
-        known = [*self.channels, *self.orbit_channels]
-        for name, derived in self.derived.items():
-            if name in known:
-                yield f"derived.{name}: a channel has the same name"
-            for read in channels_of(derived.formula):
-                if read not in known:
-                    yield f"derived.{name}.formula: unknown channel '{read}' (known: {', '.join(known) or 'none'})"
-                elif self.inputs[read].kind == "temperature":
-                    yield f"derived.{name}.formula: '{read}' is a temperature, which the model predicts; use other channels"
-            known.append(name)
-
-    def _check_loads(self, nodes: list[str]) -> Iterable[str]:
-        weights: dict[str, float] = {}
-        for i, load in enumerate(self.loads):
-            yield from self._check_end(f"loads[{i}].node", load.node, nodes)
-            yield from self._check_channel(f"loads[{i}].channel", load.channel, ("power", "auxiliary"))
-            if load.solar and load.channel in self.orbit_channels:
-                yield f"loads[{i}].solar: '{load.channel}' follows the Sun's distance already; leave it out"
-            if load.factor is not None:
-                yield from self._check_channel(f"loads[{i}].factor", load.factor, ("auxiliary",))
-            if (load.channel, load.node, load.factor) in [(x.channel, x.node, x.factor) for x in self.loads[:i]]:
-                yield f"loads[{i}]: channel '{load.channel}' heats node '{load.node}' twice; add the weights"
-            channel = self.inputs.get(load.channel)
-            if channel is None or channel.kind == "temperature":
-                continue
-            if load.table is None and channel.kind == "auxiliary":
-                yield f"loads[{i}].table: auxiliary channel '{load.channel}' is not heat; give a table with knots"
-            if load.table is not None and channel.kind == "power":
-                yield f"loads[{i}].table: '{load.channel}' is heat already; a table explains an auxiliary channel"
-            if load.table is not None and load.gain is not None:
-                yield f"loads[{i}].gain: a load with a table has no gain; its values are calibrated"
-            if load.table is not None and channel.levels is False and load.table.knots is None:
-                yield f"loads[{i}].table.knots: missing; '{load.channel}' has no levels"
-            if load.table is None and load.gain is None and channel.unit == "W" and load.factor is None:
-                weights[load.channel] = weights.get(load.channel, 0.0) + load.weight
-        for name, total in weights.items():
-            if total > 1.0 + 1e-9:
-                yield f"loads: the weights of channel '{name}' add to {total:g}; they may add to 1 at most"
-
-    def _check_channel(self, field: str, name: str, kinds: tuple[str, ...]) -> Iterable[str]:
-        if name not in self.inputs:
-            how = "declare it under channels"
-            if name.startswith(PREFIX):
-                how = "declare the orbit" if self.orbit is None else "correct its name"
-            yield f"{field}: unknown channel '{name}'; {how} (known: {', '.join(self.inputs) or 'none'})"
-        elif self.inputs[name].kind not in kinds:
-            yield f"{field}: channel '{name}' is {self.inputs[name].kind}, must be {' or '.join(kinds)}"
-
-    @staticmethod
-    def _check_end(field: str, name: str, known: list[str], what: str = "node") -> Iterable[str]:
-        if name not in known:
-            yield f"{field}: unknown {what} '{name}' (known: {', '.join(known) or 'none'})"
 
     @property
     def sensors(self) -> tuple[str, ...]:

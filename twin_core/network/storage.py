@@ -9,6 +9,9 @@ from twin_core.network.model import Network
 from twin_core.network.terms import Entry
 
 TOLERANCE_K = 1e-11
+ROUNDING = 8.0 * np.finfo(np.float64).eps
+"""Share of u and T to which u is computed: where a node stores little, that is more than the tolerance in T."""
+
 N_ITERATIONS = 100
 
 
@@ -70,15 +73,19 @@ def to_temperatures_K(
 ) -> FloatArray:
     """Return the temperatures within limits at which u is ``enthalpy_K``, (..., n_nodes).
 
-    u grows with T, so there is one: Newton's method from ``near_K``, within a bracket that is halved where the capacity
-    bends too sharply for it.
+    u grows with T, so there is one, or the limit beyond which it lies: Newton's method from ``near_K``, within a bracket that
+    is halved where the capacity bends too sharply for it, for the points that are not found yet.
     """
     if not network.capacities:
         return enthalpy_K
-    own = values[network.capacity_index]
-    wanted = enthalpy_K.reshape(-1, own.size)
+    ends_K = np.broadcast_to(np.array(limit_K)[:, None], (2, enthalpy_K.shape[-1]))
+    least, most = store(network, values, ends_K).enthalpy_K
+    wanted = np.clip(enthalpy_K, least, most).reshape(-1, least.size)
+    now = np.clip(near_K, *limit_K).reshape(wanted.shape)
+    now = np.where(wanted == least, limit_K[0], np.where(wanted == most, limit_K[1], now))
     low, high = np.full_like(wanted, limit_K[0]), np.full_like(wanted, limit_K[1])
-    now, miss_before = np.clip(near_K, *limit_K).reshape(-1, own.size), np.full_like(wanted, np.inf)
+    miss_before = np.full_like(wanted, np.inf)
+    found, rows = now.copy(), np.arange(now.shape[0])
     for _ in range(N_ITERATIONS):
         at = store(network, values, now)
         miss = at.enthalpy_K - wanted
@@ -86,8 +93,11 @@ def to_temperatures_K(
         newton = now - miss * at.slope
         slow = (np.abs(miss) > 0.5 * miss_before) | (newton < low) | (newton > high)
         following = np.where(slow & (np.abs(miss) > TOLERANCE_K), 0.5 * (low + high), newton)
-        change = float(np.abs(following - now).max(initial=0.0))
-        now, miss_before = following, np.abs(miss)
-        if change < TOLERANCE_K:
+        found[rows] = following
+        told = (np.abs(following - now) < TOLERANCE_K) | (np.abs(miss) < ROUNDING * (np.abs(now) + np.abs(wanted)))
+        goes_on = ~told.all(axis=1)
+        if not goes_on.any():
             break
-    return np.clip(now, *limit_K).reshape(enthalpy_K.shape)
+        now, wanted, low, high = (a[goes_on] for a in (following, wanted, low, high))
+        rows, miss_before = rows[goes_on], np.abs(miss)[goes_on]
+    return np.clip(found, *limit_K).reshape(enthalpy_K.shape)

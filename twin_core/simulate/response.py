@@ -21,8 +21,11 @@ from twin_core.simulate.modes import Modes
 from twin_core.simulate.one_step import take_steps
 from twin_core.simulate.relays import N_KICK, NO_RELAYS, Relays
 from twin_core.simulate.rollout import Rollout
-from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, symmetric, turning
+from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, pieces, symmetric, turning
 from twin_core.simulate.stages import balance_along
+
+MOST_VALUES, LEAST_STEPS = 16_000_000, 64
+"""So many derivatives are made at once, if that is more than so many steps: 128 MB."""
 
 Entries = tuple[IntArray, IntArray, FloatArray]
 """Which column, which node, and d (d u / d t) / d column at both ends of the steps, (n_entries, 2 n_steps)."""
@@ -58,7 +61,8 @@ def sensitivities(
     if forcing.n_steps == 0:
         yield slice(0, forcing.sample_step.size), np.repeat(start_columns[None, observed], forcing.sample_step.size, 0)
     about_K, turned, turns = None, np.zeros(0, dtype=np.int64), np.zeros((0, own.size, own.size))
-    for first, last, anchor in anchors(trajectory.stages_K[:, 0]):
+    most = max(LEAST_STEPS, MOST_VALUES // max(observed.size * state.shape[1], 1))
+    for first, last, anchor in pieces(anchors(trajectory.stages_K[:, 0]), most):
         low = int(np.searchsorted(forcing.sample_step, first, side="left" if first == 0 else "right"))
         high = int(np.searchsorted(forcing.sample_step, last, side="right"))
         stages_K, step_s = trajectory.stages_K[first:last], forcing.step_s[first:last]
@@ -67,7 +71,7 @@ def sensitivities(
         if anchor is not about_K:
             about_K = anchor
             turned, turns = turning(network, values, forcing, about_K, switched.split.parts)
-            turns = modes.inward @ (turns / own[:, None]) @ modes.outward
+            turns = turns / own[:, None]
         balance = balance_along(
             network,
             values,
@@ -103,7 +107,7 @@ def sensitivities(
 
 @dataclass(frozen=True)
 class _Split:
-    """A as it was in the rollout: its modes, C A, and which columns change it by how much, in modes."""
+    """A as it was in the rollout: its modes, C A, and which columns change it by how much, (n_turned, n, n)."""
 
     modes: Modes
     slope_W_per_K: FloatArray
@@ -254,11 +258,12 @@ def _march(
         (balance.heat_W / balance.own_J_per_K).reshape(shape),
     )
     switched = (split.relays, split.kicks, split.relay_column, split.relay_slope)
-    columns = (split.turned, split.turns, column, node, series.reshape(column.size, step_s.size, 2))
+    rest = (column, node, series.reshape(column.size, step_s.size, 2), state, sample_step, observed)
     if state.shape[0] >= MANY and split.relays.node.size == 0:
-        block, end = march_sensitivities_of_many(*along, *columns, state, sample_step, observed)
+        block, end = march_sensitivities_of_many(*along, split.turned, split.turns, *rest)
     else:
-        block, end = march_sensitivities(*along, *switched, *columns, state, sample_step, observed)
+        in_modes = split.modes.inward @ split.turns @ split.modes.outward
+        block, end = march_sensitivities(*along, *switched, split.turned, in_modes, *rest)
     if balance.moves:
         slope = np.concatenate([begin_slope, balance.slope[1::2]])
         block *= slope[sample_step][:, observed, None]

@@ -5,7 +5,7 @@ temperature tells them for all. Their Jacobian about round temperatures is the A
 another kind (convection, relays, ramps of a conductance) are evaluated along the trajectory, again and again.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -42,6 +42,13 @@ def anchors(begins_K: FloatArray) -> Iterator[tuple[int, int, FloatArray]]:
     for first in range(0, begins_K.shape[0], STRETCH):
         about = anchor_K(begins_K[first], about)
         yield first, min(first + STRETCH, begins_K.shape[0]), about
+
+
+def pieces(stretches: Iterable[tuple[int, int, FloatArray]], most: int) -> Iterator[tuple[int, int, FloatArray]]:
+    """Yield the same stretches in pieces of at most so many steps, each about the temperatures of its stretch."""
+    for first, last, about_K in stretches:
+        for begin in range(first, last, most):
+            yield begin, min(begin + most, last), about_K
 
 
 def anchor_K(state_K: FloatArray, before_K: FloatArray | None) -> FloatArray:

@@ -3,7 +3,7 @@ import { ApiError, call, follow, onKeyNeeded } from "./api.js";
 import { readAddress, writeAddress } from "./address.js";
 import { InputChart, ResidualChart, TemperatureChart, forecastLength } from "./charts.js";
 import { csvOf, save } from "./csv.js";
-import { clock, colour, count, isDark, make, seconds, span, toUnit, unitName } from "./format.js";
+import { clock, colour, count, isDark, make, seconds, span, toUnit, typed, unitName } from "./format.js";
 import { NetworkDrawing, declared } from "./network.js";
 import { drawAlarms, drawAnomalies, drawComparison, drawFleet, drawJobs, drawModels, drawNow } from "./panels.js";
 import { PlanEditor } from "./plan.js";
@@ -271,7 +271,7 @@ function renderInputs(unit) {
     range: [start, until], inputs: shown, time: archive.time.map(seconds), planned,
     values: Object.fromEntries(list.map((s) => [s.name, convert(archive.values[s.name] || archive.time.map(() => null), s)])),
   });
-  legend($("input-legend"), shown);
+  legend($("input-legend"), shown.map((s) => ({ ...s, aside: s.unit !== shown[0].unit && s.unit !== "1" })));  // those have scales of their own
 }
 
 // What the forecast takes the inputs to do, in words: ", Q_sun repeats, Q_box holds".
@@ -306,7 +306,7 @@ function legend(box, list) {
   box.replaceChildren(...list.map((s) => {
     const dot = make("span", { class: "dot" });
     dot.style.background = colour(s.index);
-    return make("button", { "aria-pressed": String(s.shown), title: "Click: show or hide. Alt-click: this one only.", onclick: (e) => toggle(s.name, e.altKey) }, dot, s.name);
+    return make("button", { "aria-pressed": String(s.shown), title: "Click: show or hide. Alt-click: this one only.", onclick: (e) => toggle(s.name, e.altKey) }, dot, s.name, s.aside ? make("span", { class: "sub" }, s.unit) : null);
   }));
   if (focused >= 0) box.children[focused]?.focus();
 }
@@ -378,12 +378,11 @@ function download() {
 }
 
 const keepAddress = () => history.replaceState(null, "", writeAddress(state.fleet ? { twin: null } : state));
-const local = (unix_s) => new Date(unix_s * 1000).toISOString().slice(0, 19);
 
 function drawTimes() {
   const shown = state.detail?.last_time ? window_s() : null;
   if (!shown || $("times").contains(document.activeElement)) return;
-  [$("from").value, $("to").value] = [local(shown.start), local(shown.stop)];
+  [$("from").value, $("to").value] = [clock(shown.start), clock(shown.stop)];
 }
 
 const room = (kind) => (kind === "calibration" ? "calibrations" : "diagnoses");
@@ -478,7 +477,7 @@ function renderFleet() {
   drawFleet($("fleet-list"), state.twins, (twin) => select(twin));
   [...$("fleet-list").querySelectorAll("button")].find((b) => b.querySelector("b").textContent === focused)?.focus();
   const busy = state.twins.filter((t) => t.red || t.yellow || t.open_anomalies || t.state === "stale").length;
-  $("fleet-note").textContent = busy ? `${busy} of ${state.twins.length} need somebody` : `${state.twins.length} twins, nothing open`;
+  $("fleet-note").textContent = busy ? `${busy} of ${state.twins.length} ${busy === 1 ? "needs" : "need"} somebody` : `${state.twins.length} twins, nothing open`;
 }
 
 function select(twin, view = {}) {
@@ -601,8 +600,9 @@ $("horizon").addEventListener("change", () => {
 });
 $("times").addEventListener("submit", (event) => {
   event.preventDefault();
-  const ends = [$("from").value, $("to").value].map((text) => Date.parse(`${text}Z`) / 1000);
-  if (!ends.every(Number.isFinite) || ends[0] >= ends[1]) return toast("The first time must come before the last one.", "bad");
+  const ends = [$("from").value, $("to").value].map(typed);
+  if (!ends.every(Number.isFinite)) return toast("Write both times as 2026-01-31 12:00, in UTC.", "bad");
+  if (ends[0] >= ends[1]) return toast("The first time must come before the last one.", "bad");
   document.activeElement.blur();
   zoomTo(ends);
 });

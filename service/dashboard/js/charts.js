@@ -114,7 +114,7 @@ export class TemperatureChart extends Chart {
     const shape = JSON.stringify([view.sensors, view.unit, css("--line"), view.forecast !== null, view.predicted !== null, view.planned !== null]);
     this.draw(shape, {
       series, bands, axes: axes(view.unit), plugins: [tooltip(this.host, (u, i) => this.rows(i))],
-      hooks: { drawAxes: [(u) => this.drawLimits(u)], draw: [(u) => this.drawMarks(u), (u) => this.drawPresent(u)] },
+      hooks: { draw: [(u) => this.drawLimits(u), (u) => this.drawMarks(u), (u) => this.drawPresent(u)] },
     }, data);
   }
 
@@ -184,8 +184,7 @@ export class TemperatureChart extends Chart {
       ctx.stroke();
       ctx.globalAlpha = 1;
       ctx.fillStyle = colour(index);
-      ctx.textAlign = "right";
-      ctx.fillText(`${name} ${look}`, bbox.left + bbox.width - 4 * dot, y - 3 * dot);
+      haloed(ctx, `${name} ${look}`, bbox.left + 4 * dot, y - 3 * dot);
     }
     ctx.restore();
   }
@@ -237,9 +236,22 @@ export class TemperatureChart extends Chart {
     ctx.stroke();
     ctx.fillStyle = css("--muted");
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
-    ctx.fillText("forecast →", x + 6 * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
+    haloed(ctx, "forecast →", x + 6 * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
     ctx.restore();
   }
+}
+
+// Text that stays readable over lines.
+function haloed(ctx, text, x, y) {
+  ctx.save();
+  ctx.textAlign = "left";
+  ctx.setLineDash([]);
+  ctx.lineJoin = "round";
+  ctx.lineWidth = 3 * devicePixelRatio;
+  ctx.strokeStyle = css("--surface");
+  ctx.strokeText(text, x, y);
+  ctx.fillText(text, x, y);
+  ctx.restore();
 }
 
 const lastOf = (column) => {

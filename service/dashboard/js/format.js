@@ -10,6 +10,12 @@ export function clock(unix_s, withDate = true) {
   return withDate ? `${day} ${time}` : time;
 }
 
+// The unix second that somebody typed as "2026-01-31 12:00[:00]", NaN if it is none; UTC, as everything here.
+export const typed = (text) => {
+  const found = /^\s*(\d{4}-\d{2}-\d{2})[T ](\d{2}:\d{2}(?::\d{2}(?:\.\d+)?)?)\s*(?:Z|UTC)?\s*$/i.exec(text);
+  return found ? Date.parse(`${found[1]}T${found[2]}Z`) / 1000 : NaN;
+};
+
 export function span(length_s) {
   const units = [[86400, "d"], [3600, "h"], [60, "min"], [1, "s"]];
   const [size, name] = units.find(([size]) => length_s >= size * 1.5) || [1, "s"];

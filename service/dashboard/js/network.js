@@ -89,13 +89,15 @@ export class NetworkDrawing {
     this.last = [picture, unit];
     const names = [...picture.nodes, ...picture.boundaries].map((p) => p.id);
     const narrow = this.host.clientWidth < 620;
-    [WIDTH, HEIGHT] = narrow ? [480, 520] : [900, 430];
+    const few = names.length <= 3;
+    [WIDTH, HEIGHT] = narrow ? [480, few ? 260 : 520] : [900, few ? 220 : 430];
     const key = JSON.stringify([narrow, names, picture.links.map((l) => l.ends)]);
     if (key !== this.key) {
       this.places = spread(layout(names, picture.links));
       this.key = key;
     }
     const svg = draw("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "group", "aria-label": describe(picture, unit) });
+    if (!narrow) svg.style.height = `${HEIGHT - 10}px`;
     const strongest = Math.max(1e-9, ...picture.links.map((l) => Math.abs(l.heat_W || 0)));
     const joined = new Set();
     const labels = [];

@@ -1,7 +1,7 @@
 // The plan of a what-if: steps of inputs in a small table, and what the service makes of them.
-import { make } from "./format.js";
+import { clock, make, typed } from "./format.js";
 
-const local = (unix_s) => new Date(Math.round(unix_s / 60) * 60000).toISOString().slice(0, 16);
+const minute = (unix_s) => clock(Math.round(unix_s / 60) * 60).slice(0, 16);
 
 // The columns that the service takes: one row per instant, an input without a step there has no value.
 export function columnsOf(steps) {
@@ -33,7 +33,7 @@ export class PlanEditor {
     const options = this.inputs.map((i) => make("option", { value: i.name }, `${i.name}${i.unit ? ` (${i.unit})` : ""}`));
     const row = make("tr", {},
       make("td", {}, make("select", { "aria-label": "Input" }, ...options)),
-      make("td", {}, make("input", { type: "datetime-local", value: local(this.now_s + 600), "aria-label": "From, UTC" })),
+      make("td", {}, make("input", { class: "instant", value: minute(this.now_s + 600), "aria-label": "From, UTC", autocomplete: "off" })),
       make("td", {}, make("input", { type: "number", step: "any", value: 0, "aria-label": "Value" })),
       make("td", {}, make("button", { type: "button", class: "ghost", "aria-label": "Remove this step", onclick: () => row.remove() }, "×")));
     this.$("plan-rows").append(row);
@@ -42,7 +42,7 @@ export class PlanEditor {
   steps() {
     return [...this.$("plan-rows").children].map((row) => {
       const [channel, from, value] = row.querySelectorAll("select, input");
-      return { channel: channel.value, time_s: Date.parse(`${from.value}Z`) / 1000, value: Number(value.value) };
+      return { channel: channel.value, time_s: typed(from.value), value: Number(value.value) };
     });
   }
 
@@ -53,7 +53,7 @@ export class PlanEditor {
 
   async show() {
     const steps = this.steps();
-    if (steps.some((s) => !Number.isFinite(s.time_s) || !Number.isFinite(s.value))) return this.refuse("Every step needs a time and a value.");
+    if (steps.some((s) => !Number.isFinite(s.time_s) || !Number.isFinite(s.value))) return this.refuse("Every step needs a time, such as 2026-01-31 12:00, and a value.");
     try {
       await this.onShow(steps.length ? columnsOf(steps) : null);
     } catch (error) {

@@ -15,10 +15,12 @@ from twin_core.discover import search as searching
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
     LESS_LIKELY,
+    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
+    SIZE_NOT_TOLD,
     Finding,
     Judged,
     Search,
@@ -40,7 +42,8 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import least_explained, withdraw
+from twin_core.discover.search import _name_what_is_nearly_a_law, least_explained, withdraw
+from twin_core.discover.told import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
@@ -163,7 +166,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         is_form = option.effects[0].where["node"] == "form"
         return replace(option, reason=NO_LAW if is_form else ""), is_form
 
-    monkeypatch.setattr(judge, "_examined", told)
+    monkeypatch.setattr(judge, "examine", told)
 
 
 @pytest.mark.usefixtures("examined")
@@ -225,21 +228,25 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
     state.findings = [Finding(judged(name, 50.0)) for name in own]
-    withdraw(state)
+    withdraw(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == kept
     assert [e.where["node"] for e in state.trial.effects] == kept
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
 @pytest.mark.parametrize(
-    ("own", "kept"),
-    [((DOMINANCE * LEAST - JUST, 90.0), ["n1"]), ((DOMINANCE * LEAST, DOMINANCE * LEAST), ["n0", "n1"])],
-    ids=["one too little", "both enough"],
+    ("own", "reason", "kept"),
+    [
+        ((DOMINANCE * LEAST - JUST, 90.0), "", ["n1"]),
+        ((DOMINANCE * LEAST - JUST, 90.0), NO_FORESIGHT, []),
+        ((DOMINANCE * LEAST, DOMINANCE * LEAST), NO_FORESIGHT, ["n0", "n1"]),
+    ],
+    ids=["one too little", "the other is nothing by itself", "both enough"],
 )
 def test_of_effects_found_together_each_must_explain_something(
-    monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], kept: list[str]
+    monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], reason: str, kept: list[str]
 ) -> None:
-    """Both together explain enough, in a network that is hardly seen to be coarse."""
+    """Both together explain enough, in a network that is hardly seen to be coarse; what is left alone is examined anew."""
     parts, left = {"n0": own[0], "n1": own[1]}, 2.0 * CHANCE
 
     def refitted(effects: tuple[Effect, ...]) -> Trial:
@@ -248,11 +255,19 @@ def test_of_effects_found_together_each_must_explain_something(
 
     monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
     monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    asked: list[tuple[Effect, ...]] = []
+
+    def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
+        asked.append(option.effects)
+        return replace(option, reason=reason), False
+
+    monkeypatch.setattr(searching, "examine", examined)
     both = (load("n0"), load("n1"))
     state = Search(refitted(both), refitted(()))
     state.findings = [Finding(Judged(both, Evidence(50.0, 0.0), state.trial))]
-    withdraw(state)
+    withdraw(state, NEEDED)
     assert [effect.where["node"] for finding in state.findings for effect in finding.effects] == kept
+    assert asked == ([] if len(kept) == 2 else [both[1:]])
 
 
 @pytest.mark.parametrize(("explained", "stands"), [(DOMINANCE * 50.0, True), (DOMINANCE * 50.0 - JUST, False)])
@@ -264,13 +279,20 @@ def test_beside_a_heat_without_a_name_all_that_stays_counts(
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
     state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
     state.findings = [Finding(option)]
-    withdraw(state)
+    withdraw(state, NEEDED)
     assert bool(state.findings) == stands
 
 
-@pytest.mark.parametrize(("change", "reason"), [(0.0, ""), (-JUST, LESS_LIKELY)])
-def test_a_correction_does_not_make_its_own_trajectories_less_likely(
-    monkeypatch: pytest.MonkeyPatch, change: float, reason: str
+SCORE = score_needed(NEEDED)
+
+
+@pytest.mark.parametrize(
+    ("change", "score", "reason"),
+    [(0.0, SCORE, ""), (-JUST, SCORE, LESS_LIKELY), (0.0, SCORE - JUST, SIZE_NOT_TOLD)],
+    ids=["both are enough", "less likely along its trajectories", "of no size"],
+)
+def test_a_correction_is_told_by_its_own_trajectories(
+    monkeypatch: pytest.MonkeyPatch, change: float, score: float, reason: str
 ) -> None:
     """However much heat that wanders at the nodes may speak for it."""
     option = judged("a", 900.0)
@@ -280,8 +302,69 @@ def test_a_correction_does_not_make_its_own_trajectories_less_likely(
         Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
     )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
-    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: False)
-    assert judge._examined(simple, option, NEEDED)[0].reason == reason
+    monkeypatch.setattr(judge, "least_score", lambda *trials: score)
+    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
+    assert judge.examine(simple, option, NEEDED)[0].reason == reason
+
+
+@pytest.mark.parametrize(("rate", "score"), [(0.05, 1.959964), (0.01, 2.575829), (0.001, 3.290527)])
+def test_the_score_asked_for_is_that_of_normal_tables(rate: float, score: float) -> None:
+    assert score_needed(threshold(rate)) == pytest.approx(score, abs=1e-6)
+
+
+SMALL = REPEATABLE_SHARE * (10.0 - 1.0)
+
+
+@pytest.mark.parametrize(
+    ("beside", "instead", "left", "reason"),
+    [
+        (None, None, 1.0, ""),
+        (SMALL, None, 1.0, NEARLY_A_LAW),
+        (None, SMALL, 1.0, NEARLY_A_LAW),
+        (SMALL + JUST, None, 1.0, NO_LAW),
+        (0.1, SMALL + JUST, 1.0, NO_LAW),
+        (MOST_COARSENESS, None, 9000.0, NEARLY_A_LAW),
+        (MOST_COARSENESS + JUST, None, 9000.0, NO_LAW),
+    ],
+    ids=["a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"],
+)
+def test_what_a_name_leaves_is_weighed_against_what_it_removes(
+    monkeypatch: pytest.MonkeyPatch, beside: float | None, instead: float | None, left: float, reason: str
+) -> None:
+    option = judged("a", 90.0, left=1.0)
+    simple = stub(left=10.0 if left == 1.0 else left)
+    monkeypatch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: beside)
+    monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
+    assert judge._merely_resembles(simple, option, NEEDED) == reason
+
+
+def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
+    """Only one that explains the readings better in its place speaks against it."""
+    lag = REGISTRY["sensor_lag"]({"sensor": "T"}, {"tau_s": 30.0})
+    option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: 1e9)
+        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
+        assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
+        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: 1e9)
+        assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
+
+
+def test_what_is_nearly_a_law_is_named_where_nothing_else_is() -> None:
+    state = Search(stub(), stub())
+    likely, less = (replace(judged(node, nats), reason=NEARLY_A_LAW) for node, nats in (("a", 90.0), ("b", 60.0)))
+    state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
+    _name_what_is_nearly_a_law(state)
+    assert [f.effects[0].where["node"] for f in state.findings] == ["a"] and state.trial is likely.trial
+    assert [j.effects[0].where["node"] for j in state.rejected] == ["c", "b"]
+
+
+def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
+    state = Search(stub(), stub())
+    option = judged("a", 90.0)
+    state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=NEARLY_A_LAW)]
+    _name_what_is_nearly_a_law(state)
+    assert not state.findings
 
 
 @given(st.floats(0.0, 1e6), st.floats(1.0, 2.0), st.integers(10, 10**7))

@@ -1,5 +1,7 @@
 """Capacities that change with temperature: warming at constant heat in closed form, and a cycle against SciPy."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.integrate import cumulative_simpson, solve_ivp
@@ -7,9 +9,10 @@ from scipy.special import ndtr
 
 from tests.helpers import at_named, central_difference, conductive_spec, record_of
 from twin_core.effects import REGISTRY, Effect
+from twin_core.network import storage
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec_io import load_spec
-from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
+from twin_core.network.storage import Storage, store, to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 
@@ -116,6 +119,33 @@ def test_a_temperature_is_found_from_its_enthalpy(width_K: float) -> None:
     for near in (temperature, np.full_like(temperature, 250.0), np.full_like(temperature, 300.0)):
         found = to_temperatures_K(network, values, enthalpy, near, (0.5, 5e3))
         np.testing.assert_allclose(found, temperature, atol=1e-9)
+
+
+def test_a_temperature_is_found_as_well_as_rounding_allows_and_no_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where hardly anything is stored u is told to fewer digits of T: no bisection between two neighbouring numbers."""
+    network = network_with(STIFFENING.with_values({"kappa_per_K": -0.7}))
+    values = network.parameters.values
+    temperature = np.linspace(293.0, 400.0, 301)[:, None]
+    enthalpy = to_enthalpy_K(network, values, temperature)
+    n_looks = 0
+
+    def counted(*arguments: Any) -> Storage:
+        nonlocal n_looks
+        n_looks += 1
+        return store(*arguments)
+
+    monkeypatch.setattr(storage, "store", counted)
+    found = to_temperatures_K(network, values, enthalpy, np.full_like(temperature, 294.0), (0.5, 5e3))
+    slopes = store(network, values, temperature).slope
+    assert (np.abs(found - temperature) < 1e-11 + 1e-12 * slopes).all()
+    assert n_looks < 40
+
+
+def test_beyond_a_limit_the_limit_is_returned() -> None:
+    network = network_with(STIFFENING)
+    values = network.parameters.values
+    found = to_temperatures_K(network, values, np.array([[-1e9], [1e9]]), np.array([[290.0], [290.0]]), (100.0, 500.0))
+    assert found.tolist() == [[100.0], [500.0]]
 
 
 def test_a_capacity_that_grows_takes_up_more() -> None:

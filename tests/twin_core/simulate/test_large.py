@@ -5,6 +5,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+import twin_core.simulate.large as large_module
 import twin_core.simulate.response as response_module
 from tests.twin_core.network.test_declared_terms import START_K, data, record
 from twin_core.network.model import build_network
@@ -14,8 +15,10 @@ from twin_core.simulate.response import sensitivities
 from twin_core.simulate.rollout import rollout
 
 
-@pytest.mark.parametrize("with_start", [False, True])
-def test_both_ways_agree(with_start: bool) -> None:
+@pytest.mark.parametrize(
+    ("with_start", "sparse", "most"), [(False, 0.0, 10**9), (True, np.inf, 10**9), (True, np.inf, 40)]
+)
+def test_both_ways_agree(with_start: bool, sparse: float, most: int) -> None:
     network = build_network(load_spec(data()))
     forcing = build_forcing(network, record(), 25.0)
     parameters, start = network.parameters, np.array(list(START_K.values()))
@@ -28,6 +31,10 @@ def test_both_ways_agree(with_start: bool) -> None:
         return np.concatenate([block for _, block in blocks])
 
     small = found()
-    with patch.object(response_module, "MANY", 1):
+    with (
+        patch.object(response_module, "MANY", 1),
+        patch.object(large_module, "SPARSE", sparse),
+        patch.multiple(response_module, MOST_VALUES=most, LEAST_STEPS=7),
+    ):
         large = found()
     np.testing.assert_allclose(large, small, atol=1e-9 * np.abs(small).max())

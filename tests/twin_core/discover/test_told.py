@@ -1,0 +1,91 @@
+"""By how many standard deviations effects move the readings: against refits of many draws of the noise, and confounded."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import curve_fit
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.second_order import fit_network
+from twin_core.discover.confirm import Trial, try_effects
+from twin_core.discover.told import least_score, score_needed
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect
+from twin_core.network.spec_io import load_spec
+from twin_core.telemetry import Record
+
+C, G, ROOM_K, NOISE_K = 500.0, 0.8, 290.0, 0.1
+STEP_S, N = 60.0, 240
+TIME_S = STEP_S * np.arange(N)
+SPEC = {
+    "twin": "block",
+    "boundaries": {"room": {"value_K": ROOM_K}},
+    "channels": {
+        "T": {"kind": "temperature", "unit": "K", "noise_std": NOISE_K},
+        "P": {"kind": "power", "unit": "W", "interpolation": "linear"},
+    },
+    "nodes": [{"id": "block", "sensor": "T", "capacity_J_per_K": {"guess": 400.0}}],
+    "conductors": [{"between": ["block", "room"], "conductance_W_per_K": {"guess": 1.0}}],
+    "loads": [{"channel": "P", "node": "block", "gain": {"value": 1.0}}],
+}
+
+
+def power_W(period_s: float) -> FloatArray:
+    return 8.0 + 6.0 * np.sin(2.0 * np.pi * TIME_S / period_s)
+
+
+def trials(effect: Effect, hidden_W: FloatArray, period_s: float) -> tuple[Trial, Trial]:
+    """Return the declared model and the one with an effect, fitted to a block under a hidden heat."""
+    heat_W = power_W(period_s) + hidden_W
+    path = solve_ivp(
+        lambda t, x: (np.interp(t, TIME_S, heat_W) - G * (x - ROOM_K)) / C,
+        (0.0, TIME_S[-1]),
+        [300.0],
+        t_eval=TIME_S,
+        rtol=1e-9,
+        atol=1e-9,
+        max_step=STEP_S,
+    )
+    measured = path.y[0] + NOISE_K * np.random.default_rng(5).standard_normal(N)
+    record = Record(TIME_S, {"T": measured, "P": power_W(period_s)}, None, "block")
+    fit, calibration = fit_network(load_spec(SPEC), [record])
+    simple = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    return simple, try_effects(simple, (effect,), n_passes=12)
+
+
+def block_K(theta: FloatArray) -> FloatArray:
+    """Return the block's temperatures in closed form, of ln C, ln G, a constant load in W, and where it starts in K."""
+    (c, g), load_W, start_K = np.exp(theta[:2]), theta[2], theta[3]
+    heat_W, fade, lag_s = power_W(3000.0) + load_W, np.exp(-g * STEP_S / c), c / g
+    slope = np.diff(heat_W) / STEP_S
+    gain_K = (heat_W[:-1] * (1.0 - fade) + slope * (STEP_S - lag_s * (1.0 - fade))) / g
+    path = [start_K - ROOM_K]
+    for gain in gain_K:
+        path.append(path[-1] * fade + gain)
+    return ROOM_K + np.array(path)
+
+
+def test_the_score_is_that_of_many_draws_of_the_noise() -> None:
+    """SciPy refits the closed form to 300 records: how well what the load does is told beside all else."""
+    effect = REGISTRY["constant_heat_load"]({"node": "block"}, {"Q_W": 1.0})
+    simple, rich = trials(effect, np.full(N, 1.5), 3000.0)
+    truth, rng = np.array([np.log(C), np.log(G), 1.5, 300.0]), np.random.default_rng(1)
+    clean, done = block_K(truth), []
+    for _ in range(300):
+        record = clean + NOISE_K * rng.standard_normal(N)
+        theta, _ = curve_fit(lambda t, *x: block_K(np.array(x)), TIME_S, record, p0=truth)
+        done.append(block_K(theta) - block_K(theta * [1.0, 1.0, 0.0, 1.0]))
+    oracle = np.sqrt((np.mean(done, axis=0) ** 2).sum() / np.var(done, axis=0).sum())
+    assert least_score(simple, rich) == pytest.approx(oracle, rel=0.2)
+
+
+@pytest.mark.parametrize(("period_s", "is_told"), [(3000.0, False), (1900.0, True)], ids=["same period", "another one"])
+def test_a_load_with_the_period_of_a_declared_input_has_no_size(period_s: float, is_told: bool) -> None:
+    """Its share of the swing is what a smaller capacity would add to that of the input."""
+    hidden = 2.0 * np.cos(2.0 * np.pi * TIME_S / period_s)
+    effect = REGISTRY["periodic_heat_load"](
+        {"node": "block"}, {"Q_W": 0.1, "A_W": 1.5, "B_W": 0.1, "P_s": period_s}, {"origin_s": 0.0, "dated": False}
+    )
+    simple, rich = trials(effect, hidden, 3000.0)
+    assert rich.fit.log_posterior > simple.fit.log_posterior + 50.0
+    assert (least_score(simple, rich) > score_needed(np.log(100.0))) == is_told
