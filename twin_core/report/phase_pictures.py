@@ -37,8 +37,10 @@ def phase_pictures(report: Mapping[str, Any], plots: Mapping[str, Any], criteria
         residuals = []
         for sensor, series in (drawn.get("sensors") or {}).items():
             limits = (plots.get("limits") or {}).get(sensor) or {}
-            ends = (str(drawn["ends"][0]), str(drawn["ends"][1]))
-            picture = draw_residuals(series, [True] * len(series["measured"]), _histogram(series), limits, ends)
+            first, last = (end if isinstance(end, str) else f"{end:g} s" for end in drawn["ends"])
+            picture = draw_residuals(
+                series, [True] * len(series["measured"]), _histogram(series), limits, (first, last)
+            )
             if picture:
                 residuals.append({"name": sensor, "picture": picture})
         picture = draw_deviations(phase, criteria.get("bias_K"))
