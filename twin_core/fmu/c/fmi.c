@@ -79,7 +79,12 @@ static void refresh(Instance *m) {
     if (m->known) return;
     rates_at(m, m->value[0], m->value + STATES, m->value + RATES);
     network_outputs(m->value[0], m->value + STATES, m->value + PARAMETERS, m->value + OUTPUTS);
-    for (int k = 0; k < N_RELAYS; k++) margins(m, k, m->value + STATES, m->value + INDICATORS + 2 * k);
+    for (int k = 0; k < N_RELAYS; k++) {
+        double *indicator = m->value + INDICATORS + 2 * k;
+        margins(m, k, m->value + STATES, indicator);
+        if (m->share[k] == 1.0) indicator[0] = 1.0; /* what is on is not called on again: no event */
+        if (m->share[k] == 0.0) indicator[1] = 1.0;
+    }
     m->known = 1;
 }
 
