@@ -270,14 +270,14 @@ def withdraw(state: Search, needed: float) -> None:
 
 
 def _examine_again(state: Search, places: Collection[object], needed: float) -> None:
-    """Withdraw the finding at places if by itself it does not pass what any option must."""
+    """Withdraw the finding at places if by itself it does not pass what any option must; little that it leaves was explained."""
     without = _attempted_without(state, places)
     finding = next(f for f in state.findings if {effect.place for effect in f.effects} == places)
     if without is None:
         return
     option = replace(finding.judged, trial=state.trial)
     examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
-    if examined is not None and examined[0].reason:
+    if examined is not None and examined[0].reason not in ("", NEARLY_A_LAW):
         state.rejected.append(examined[0])
         _drop(state, places, *without)
 

@@ -4,7 +4,9 @@ What long trajectories suggest is weighed as everything else is: against heat th
 that wanders at the sensors.
 """
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import comb
 
@@ -70,10 +72,13 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     screenings = screened(seed, fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
-    judged = []
-    for effect in refined(fit, shortlist(rankings, needed, N_REFITS)):
+
+    def fitted(effect: Effect) -> Judged | None:
         work = partial(_fitted, state, seed, effect, comb(n_tried, n_together))
-        judged.append(state.attempt(work, f"{effect.label} on trajectories"))
+        return state.attempt(work, f"{effect.label} on trajectories")
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
+        judged = list(pool.map(fitted, refined(fit, shortlist(rankings, needed, N_REFITS))))
     return [j for j in judged if j is not None]
 
 

@@ -238,10 +238,11 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     ("own", "reason", "kept"),
     [
         ((DOMINANCE * LEAST - JUST, 90.0), "", ["n1"]),
+        ((DOMINANCE * LEAST - JUST, 90.0), NEARLY_A_LAW, ["n1"]),
         ((DOMINANCE * LEAST - JUST, 90.0), NO_FORESIGHT, []),
         ((DOMINANCE * LEAST, DOMINANCE * LEAST), NO_FORESIGHT, ["n0", "n1"]),
     ],
-    ids=["one too little", "the other is nothing by itself", "both enough"],
+    ids=["one too little", "the other is nearly a law", "the other is nothing by itself", "both enough"],
 )
 def test_of_effects_found_together_each_must_explain_something(
     monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], reason: str, kept: list[str]
