@@ -43,8 +43,10 @@ test: $(STAMP)
 test-fast: $(STAMP)
 	$(PYTEST) -m "not slow and not e2e and not browser and not ground and not fleet"
 
+# On PostgreSQL: several processes and their faults, then every test of the service that starts no process of its own.
 test-fleet: $(STAMP)
-	$(BIN)/pytest -m fleet tests/service/fleet
+	TWIN_TEST_STORE=postgres $(BIN)/pytest -m fleet tests/service/fleet
+	TWIN_TEST_STORE=postgres $(PYTEST) -m "not fleet and not e2e and not browser and not ground" tests/service
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -92,7 +94,9 @@ bench-service: $(STAMP)
 
 bench-fleet: $(STAMP)
 	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.fleet_filter
 	$(BIN)/python -m benchmarks.family
+	$(BIN)/python -m benchmarks.fleet_stream
 
 bench-paper-b: $(BENCH)
 	$(BIN)/python -m benchmarks.paper_b

@@ -138,8 +138,10 @@ def claims(url: str, count: int) -> tuple[float, float]:
 
 
 @contextlib.contextmanager
-def services(url: str, count: int, folder: Path, **settings: str) -> Iterator[list[tuple[str, subprocess.Popen[str]]]]:
-    """Yield running services with a workbench that answers at once."""
+def services(
+    url: str, count: int, folder: Path, command: Sequence[str] = (sys.executable, "-c", FAKE), **settings: str
+) -> Iterator[list[tuple[str, subprocess.Popen[str]]]]:
+    """Yield running services, by default with a workbench that answers at once."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("TWIN_")} | {
         "TWIN_PORT": "0",
         "TWIN_DATABASE_URL": url,
@@ -150,9 +152,8 @@ def services(url: str, count: int, folder: Path, **settings: str) -> Iterator[li
     running = []
     with (folder / "server.log").open("ab") as log:
         for _ in range(count):
-            command = [sys.executable, "-c", FAKE]
             process = subprocess.Popen(
-                command, env=environment, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+                list(command), env=environment, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
             )
             assert process.stdout is not None
             running.append((process.stdout.readline().removeprefix("listening on ").strip(), process))

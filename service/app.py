@@ -14,7 +14,20 @@ from service.http.body_limit import Bodies
 from service.http.deps import known_parameters
 from service.http.head import Heads
 from service.http.observe import Observe
-from service.http.routes import admin, alarms, dashboard, health, jobs, live, models, rows, streams, telemetry, twins
+from service.http.routes import (
+    admin,
+    alarms,
+    dashboard,
+    fleet,
+    health,
+    jobs,
+    live,
+    models,
+    rows,
+    streams,
+    telemetry,
+    twins,
+)
 from service.http.shortcut import Shortcut
 from service.monitoring.metrics import Metrics
 from service.running.start import running
@@ -27,6 +40,7 @@ ROUTERS = (
     telemetry.router,
     telemetry.quarantine,
     twins.router,
+    fleet.router,
     jobs.calibrations,
     jobs.diagnoses,
     models.router,

@@ -1,7 +1,7 @@
 """The closed loop: calibrate, find what is missing, add it, and measure on telemetry that no choice has seen."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -20,6 +20,7 @@ from twin_core.discover.judge import NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
+from twin_core.effects.base import Effect
 from twin_core.errors import TelemetryError
 from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
@@ -66,6 +67,7 @@ def close_loop(
     false_alarm_rate: float = 0.01,
     deadline_s: float | None = None,
     moments: Sequence[Moment] = (),
+    first: Collection[Effect] = (),
     progress: Progress = no_progress,
 ) -> ClosedLoop:
     """Close the loop on telemetry.
@@ -89,6 +91,8 @@ def close_loop(
     moments
         Instants and phases of the training telemetry at which the report tells heat flows; by default the average, the
         hottest and the coldest moment of its last segment.
+    first
+        Effects that spacecraft of the same design have: at their places they are tried wherever they could matter.
     progress
         Called with the fraction done; may raise to cancel.
 
@@ -120,6 +124,7 @@ def close_loop(
             latest,
             begun,
             moments,
+            first,
             progress,
         )
 
@@ -135,6 +140,7 @@ def _close_loop(
     latest: float,
     begun: float,
     moments: Sequence[Moment],
+    first: Collection[Effect],
     progress: Progress,
 ) -> ClosedLoop:
     """Close the loop on checked arguments.
@@ -154,6 +160,7 @@ def _close_loop(
         base,
         false_alarm_rate=false_alarm_rate,
         deadline=deadline,
+        first={effect.place for effect in first},
         progress=lambda f, m: progress(0.35 + 0.5 * f, m),
     )
     found.every = every

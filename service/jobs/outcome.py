@@ -49,7 +49,12 @@ def save(connection: Connection, twin: int, finished: Finished) -> tuple[int | N
     if decision.activate:
         models.activate(connection, twin, version, decision.reason)
     _explain(connection, twin, finished)
-    return (version if decision.activate else None), _end(connection, twin, finished, version, decision)
+    unlike = finished.outcome.extra.get("family", {}).get("differs", {})
+    rows = anomalies.tell_family(connection, twin, version, finished.provenance["epoch_us"], unlike)
+    news = [("anomaly", {"anomaly": row.wire()}) for row in rows if decision.activate]
+    told = [EventStretch(tuple(events.append(connection, twin, now_us(), news)))] if news else []
+    ended = _end(connection, twin, finished, version, decision)
+    return (version if decision.activate else None), [*told, *ended]
 
 
 def _summary(finished: Finished) -> Json:

@@ -237,7 +237,9 @@ class Jobs:
             await self._say(held, 0.0, f"takes {chosen.words}")
         telemetry = _telemetry(twin, chosen.samples)
         active = await self._database.read(models.active, twin.key)
-        task, function = self._task(twin, held.kind, request, telemetry, active)
+        family = twin.specification.get("family")
+        siblings = {} if family is None else await self._database.read(models.siblings, family, twin.name)
+        task, function = self._task(twin, held.kind, request, telemetry, active, siblings)
         future = self._executor.start(work, (self._workbench, function, task), {}, self._reporter(held), cancel)
         made = await asyncio.wrap_future(future)
         provenance = {
@@ -259,14 +261,20 @@ class Jobs:
         await self._hub.write(held.twin, outcome.announce, held.twin, held.kind, held.job, *change)
 
     def _task(
-        self, twin: Entry, kind: str, request: Json, telemetry: Telemetry, active: Active | None
+        self,
+        twin: Entry,
+        kind: str,
+        request: Json,
+        telemetry: Telemetry,
+        active: Active | None,
+        siblings: dict[str, Json],
     ) -> tuple[CalibrationTask | DiagnosisTask, str]:
         if kind == "diagnosis":
             options = {name: request[name] for name in ("holdout", "burn_in_s", "false_alarm_rate")}
-            return DiagnosisTask(twin.specification, telemetry, **options), "diagnose"
+            return DiagnosisTask(twin.specification, telemetry, **options, siblings=siblings), "diagnose"
         rival = None if active is None else active.parsed()
         cut = validation_start(telemetry, None if active is None else active.train_stop_us)
-        return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival), "calibrate"
+        return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival, siblings), "calibrate"
 
     async def choose(self, twin: Entry, request: Json) -> Selection:
         """Return the part of the archive that a request names; TooLittle if it holds too little."""

@@ -13,8 +13,9 @@ from service.fleet.ownership import Ownership
 from service.instants import now_us
 from service.jobs.runner import LEAST_SAMPLES, Jobs
 from service.schemas import CalibrationRequest, DiagnosisRequest
-from service.store import anomalies, audit, jobs, twins
+from service.store import audit, fleet, jobs
 from service.store.database import Database
+from service.store.fleet import Duty
 from service.twins.registry import Entry, Registry
 from twin_core.anomaly import adjusted, discoveries
 
@@ -95,12 +96,17 @@ class Schedule:
         while True:
             await asyncio.sleep(TICK_S)
             refuted = self._refuted()
+            try:
+                duties = await self._database.read(fleet.duties)
+            except Refusal as error:
+                log.info("nobody looks for work", extra={"reason": error.detail})
+                continue
             for twin in self._registry:
-                if not self._ownership.owns(twin.key):
+                if twin.key not in duties or not self._ownership.owns(twin.key):
                     self._watches.pop(twin.key, None)
                     continue
                 try:
-                    await self._look(twin, time.monotonic(), twin.key in refuted)
+                    await self._look(twin, duties[twin.key], time.monotonic(), twin.key in refuted)
                 except Refusal as error:
                     log.info("no recalibration", extra={"twin": twin.name, "reason": error.detail})
 
@@ -110,14 +116,12 @@ class Schedule:
         fallen = discoveries([adjusted(value) for value in most.values()], self._refutation_rate)
         return {key for key, is_fallen in zip(most, fallen, strict=True) if is_fallen}
 
-    async def _look(self, twin: Entry, now_s: float, is_refuted: bool) -> None:
-        head = await self._database.read(twins.get, twin.name)
-        open_ids = await self._database.read(anomalies.open_ids, twin.key, head.active_version)
+    async def _look(self, twin: Entry, head: Duty, now_s: float, is_refuted: bool) -> None:
         watch = self._watches.setdefault(twin.key, Watch(now_s, 0))
         triggers = []
         if watch.due_by_schedule(now_s, self._every_s, head.samples):
             triggers.append("schedule")
-        if watch.due_by_anomaly(now_s, self._patience_s, open_ids):
+        if watch.due_by_anomaly(now_s, self._patience_s, head.open_ids):
             triggers.append("anomaly")
         if triggers and head.samples >= LEAST_SAMPLES and not await self._jobs.busy(twin):
             watch.calibrated_s, watch.samples = now_s, head.samples

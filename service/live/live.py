@@ -1,22 +1,39 @@
 """The live state of every twin: one tracker each, and the engine they share."""
 
+import contextlib
 import copy
+from collections.abc import Sequence
 
 from service.errors import Refusal
 from service.fleet.ownership import Ownership
+from service.instants import now_us
 from service.live import pulse as pulses
 from service.live.engine import Engine
 from service.live.known import Known, Stored
 from service.live.limits import LimitWatch
-from service.live.pulse import Beat, Pulse
+from service.live.pulse import Beat, Overall, Pulse
 from service.live.scores import Scores
 from service.live.tracker import Tracker
 from service.monitoring.metrics import Metrics
+from service.store import fleet
+from service.store.connection import Connection
 from service.store.database import Database
+from service.store.errors import TwinGone
 from service.stream.hub import Hub
 from service.twins.registry import Entry
 from service.workbench.interface import Json, MakeWorkbench, Outcome
 from twin_core.anomaly import Thresholds
+
+AT_ONCE = 100
+"""So many twins are looked at by one reader, before others have their turn."""
+
+
+def _brought_up(connection: Connection, twins: Sequence[tuple[Entry, Pulse | None]]) -> dict[int, Pulse]:
+    found = {}
+    for twin, known in twins:
+        with contextlib.suppress(TwinGone):
+            found[twin.key] = pulses.brought_up(connection, twin.key, len(twin.channels), known)
+    return found
 
 
 class Live:
@@ -85,6 +102,31 @@ class Live:
         pulse = await self._database.read(pulses.brought_up, twin.key, len(twin.channels), known)
         self._pulses[twin.key] = pulse
         return dict(zip(twin.channels, pulse.beats(), strict=True))
+
+    async def beats_of(self, twins: Sequence[Entry]) -> dict[int, dict[str, Beat]]:
+        """Return when each channel of twins was last heard of, in their order, by the twin's number.
+
+        One look at the database tells which twins have changed: only those are looked at.
+        """
+        marks = await self._database.read(fleet.marks)
+        changed = [twin for twin in twins if twin.key in marks and not self._is_known(twin, *marks[twin.key])]
+        for first in range(0, len(changed), AT_ONCE):
+            known = [(twin, copy.deepcopy(self._pulses.get(twin.key))) for twin in changed[first : first + AT_ONCE]]
+            self._pulses |= await self._database.read(_brought_up, known)
+        held = [(twin, self._pulses[twin.key]) for twin in twins if twin.key in marks and twin.key in self._pulses]
+        return {twin.key: dict(zip(twin.channels, pulse.beats(), strict=True)) for twin, pulse in held}
+
+    def _is_known(self, twin: Entry, seq: int, revision: int) -> bool:
+        pulse = self._pulses.get(twin.key)
+        return pulse is not None and (pulse.seq, pulse.revision) == (seq, revision)
+
+    async def standings(self, twins: Sequence[Entry]) -> list[tuple[Overall, float | None]]:
+        """Return how the sensors of twins stand, all of a twin together, and for how long nothing has arrived, in seconds."""
+        beats, at_us = await self.beats_of(twins), now_us()
+        return [
+            pulses.overall([beat for name, beat in beats.get(twin.key, {}).items() if name in twin.sensor_names], at_us)
+            for twin in twins
+        ]
 
     def find(self, twin: int) -> Tracker | None:
         """Return the tracker of a twin, None if nothing follows its samples."""

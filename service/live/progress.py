@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.instants import now_us
-from service.store import anomalies, checkpoints, events, residuals, samples
+from service.store import anomalies, checkpoints, events, fleet, residuals, samples
 from service.store.anomalies import AnomalyRow, Change
 from service.store.checkpoints import Checkpoint
 from service.store.connection import Connection
+from service.store.fleet import Vital
 from service.store.residuals import Residuals
 from service.store.samples import Samples
 from service.stream.messages import EventStretch, ResidualStretch, Stretch
@@ -107,11 +108,25 @@ def save(connection: Connection, twin: Entry, step: Step) -> tuple[None, Sequenc
     ended = (
         anomalies.close(connection, twin.key, step.version, step.after_us, step.after_us + 1) if step.after_gap else []
     )
+    fleet.note(connection, twin.key, step.version, vital_of(twin.sensors, step))
     rows = anomalies.apply(connection, twin.key, step.version, step.changes, step.span_us)
     stretches += _news(connection, twin, ended + rows)
     if step.checkpoint is not None:
         checkpoints.put(connection, twin.key, step.version, step.checkpoint, keep_previous=step.after_gap)
     return None, stretches
+
+
+def vital_of(sensors: Sequence[str], step: Step) -> Vital | None:
+    """Return the worst of the newest residuals of a step: of each sensor the last one counts; None where nothing was read."""
+    scaled = np.abs(step.innovation_K / step.innovation_std_K)
+    seen = np.isfinite(scaled)
+    if not seen.any():
+        return None
+    last = seen.shape[0] - 1 - seen[::-1].argmax(axis=0)
+    newest = np.where(seen.any(axis=0), scaled[last, np.arange(len(sensors))], -1.0)
+    worst = int(newest.argmax())
+    at = int(last[worst])
+    return Vital(int(step.time_us[at]), sensors[worst], float(step.innovation_K[at, worst]), float(newest[worst]))
 
 
 def _news(connection: Connection, twin: Entry, rows: Sequence[AnomalyRow]) -> list[Stretch]:

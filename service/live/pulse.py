@@ -1,5 +1,6 @@
 """Is telemetry live? When each channel was last heard of, by the clock of this machine, and whether that is long ago."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,6 +23,7 @@ MOST = 200_000
 """At most so many samples are looked through for a channel that has been silent for long."""
 
 Standing = Literal["live", "delayed", "stale", "never"]
+Overall = Literal["live", "delayed", "stale", "partly", "never"]
 
 
 @dataclass(frozen=True)
@@ -76,9 +78,11 @@ class Pulse:
         self.seq, self.revision = -1, revision
         self._instants_us: list[list[int]] = [[] for _ in range(n_channels)]
         self._received_us = [0] * n_channels
+        self._beats: list[Beat] | None = None
 
     def hear(self, batch: Batch) -> None:
         """Take in samples in any order; of each channel the newest readings count."""
+        self._beats = None
         finite = np.isfinite(batch.values)
         for row in np.flatnonzero(finite.any(axis=1)).tolist():
             instants, received = batch.time_us[finite[row]], batch.received[finite[row]]
@@ -95,11 +99,27 @@ class Pulse:
 
     def beats(self) -> list[Beat]:
         """Return what is known of each channel, in their order."""
-        found = []
+        if self._beats is None:
+            self._beats = list(self._made())
+        return self._beats
+
+    def _made(self) -> Iterator[Beat]:
         for known, received_us in zip(self._instants_us, self._received_us, strict=True):
             interval_s = float(np.median(np.diff(known))) / 1e6 if len(known) > 1 else None
-            found.append(Beat(known[-1] if known else None, received_us or None, interval_s))
-        return found
+            yield Beat(known[-1] if known else None, received_us or None, interval_s)
+
+
+def overall(sensors: Sequence[Beat], at_us: int) -> tuple[Overall, float | None]:
+    """Return how the sensors of a twin stand, all of them together, and for how long nothing has arrived, in seconds."""
+    silent_s = min((s for beat in sensors if (s := beat.silent_s(at_us)) is not None), default=None)
+    states = {beat.standing(at_us) for beat in sensors}
+    if states <= {"never"}:
+        return "never", silent_s
+    if states <= {"stale", "never"}:
+        return "stale", silent_s
+    if "stale" in states:
+        return "partly", silent_s
+    return "delayed" if "delayed" in states else "live", silent_s
 
 
 def brought_up(connection: Connection, twin: int, n_channels: int, known: Pulse | None) -> Pulse:

@@ -3,12 +3,14 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from service.errors import Refusal
 from service.fleet.ownership import Alone, Ownership
 from service.instants import in_words, now_us
 from service.jobs import outcome
 from service.live.live import Live
+from service.live.pulse import Beat
 from service.store.errors import LeaseLost, TwinGone
 from service.stream.hub import Hub
 from service.twins.registry import Entry, Registry
@@ -37,20 +39,27 @@ class Silence:
     async def _run(self) -> None:
         while True:
             await asyncio.sleep(LOOK_EVERY_S)
-            for twin in self._registry:
-                if not self._ownership.owns(twin.key):
-                    self._silent.pop(twin.key, None)
+            owned = [twin for twin in self._registry if self._ownership.owns(twin.key)]
+            self._silent = {twin.key: self._silent.get(twin.key, frozenset()) for twin in owned}
+            try:
+                beats = await self._live.beats_of(owned)
+            except Refusal as error:
+                log.info("nobody can tell which sensors are silent", extra={"reason": error.detail})
+                continue
+            for twin in owned:
+                if twin.key not in beats:
                     continue
                 try:
-                    await self.look(twin)
+                    await self.look(twin, beats[twin.key])
                 except (TwinGone, LeaseLost):
                     self._silent.pop(twin.key, None)
                 except Exception:
                     log.exception("nobody can tell which sensors are silent", extra={"twin": twin.name})
 
-    async def look(self, twin: Entry) -> None:
+    async def look(self, twin: Entry, beats: Mapping[str, Beat] | None = None) -> None:
         """Tell which sensors of a twin fell silent since the last look, and which ones are heard again."""
-        beats, at_us = await self._live.beats(twin), now_us()
+        beats = beats or await self._live.beats(twin)
+        at_us = now_us()
         silent = frozenset(name for name in twin.sensors if beats[name].standing(at_us) == "stale")
         before = self._silent.get(twin.key, frozenset())
         self._silent[twin.key] = silent

@@ -13,7 +13,7 @@ from prometheus_client import (
     generate_latest,
 )
 
-from service.store.watch import Vitals
+from service.store.fleet import Glance
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -59,17 +59,17 @@ class Metrics:
         for collector in (ProcessCollector, PlatformCollector, GCCollector):
             collector(registry=self.registry)
 
-    def show(self, vitals: Iterable[Vitals]) -> None:
+    def show(self, twins: Iterable[Glance]) -> None:
         """Show the twins as they are now, and no longer those that are gone."""
         self.open_anomalies.clear()
         self.last_sample_s.clear()
         self.open_alarms.clear()
-        for twin in vitals:
-            self.open_anomalies.labels(twin.twin).set(twin.open_anomalies)
-            self.open_alarms.labels(twin.twin, "yellow").set(twin.yellow)
-            self.open_alarms.labels(twin.twin, "red").set(twin.red)
+        for twin in twins:
+            self.open_anomalies.labels(twin.name).set(twin.open_anomalies)
+            self.open_alarms.labels(twin.name, "yellow").set(twin.yellow)
+            self.open_alarms.labels(twin.name, "red").set(twin.red)
             if twin.last_us is not None:
-                self.last_sample_s.labels(twin.twin).set(twin.last_us / 1e6)
+                self.last_sample_s.labels(twin.name).set(twin.last_us / 1e6)
 
     def render(self) -> bytes:
         """Return everything in the text format of Prometheus."""

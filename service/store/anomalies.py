@@ -1,7 +1,8 @@
 """Anomalies: intervals in which a sensor does not behave as its model says."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 import orjson
@@ -15,7 +16,10 @@ WORDS = {
     "quantised": "repeats its readings more often than it used to",
     "dropout": "does not report while others do",
     "joint": "together depart from their model",
+    "family": "is unlike its family",
 }
+FAMILY = "family"
+"""Said of a parameter when a model is made; no residual begins or ends it."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ def apply(
         news.append(number)
     kept = ",".join(map(str, confirmed or {0}))
     connection.execute(
-        f"""DELETE FROM anomaly WHERE twin = ? AND version = ? AND start_us > ? AND start_us <= ?
+        f"""DELETE FROM anomaly WHERE twin = ? AND version = ? AND kind <> '{FAMILY}' AND start_us > ? AND start_us <= ?
             AND id NOT IN ({kept})""",
         (twin, version, *span_us),
     )
@@ -111,11 +115,27 @@ def apply(
 
 def close(connection: Connection, twin: int, version: int, stop_us: int, until_us: int) -> list[AnomalyRow]:
     """End the intervals that began before ``until_us`` and last: nothing is known of what followed ``stop_us`` there."""
-    query = """UPDATE anomaly SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END
-               WHERE twin = ? AND version = ? AND stop_us IS NULL AND start_us < ?
+    query = f"""UPDATE anomaly SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END
+               WHERE twin = ? AND version = ? AND kind <> '{FAMILY}' AND stop_us IS NULL AND start_us < ?
                RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
     return [
         AnomalyRow(*row) for row in connection.execute(query, (stop_us, stop_us, twin, version, until_us)).fetchall()
+    ]
+
+
+def tell_family(
+    connection: Connection, twin: int, version: int, start_us: int, differs: Mapping[str, float]
+) -> list[AnomalyRow]:
+    """Write down in which parameters a model is unlike its family, with two-sided p-values; scores are in standard deviations."""
+    query = """INSERT INTO anomaly (twin, version, sensor, kind, start_us, stop_us, score, cause)
+               VALUES (?, ?, ?, ?, ?, NULL, ?, NULL) RETURNING id, sensor, kind, start_us, stop_us, score, cause, version"""
+    return [
+        AnomalyRow(
+            *connection.execute(
+                query, (twin, version, parameter, FAMILY, start_us, -NormalDist().inv_cdf(max(p, 1e-300) / 2.0))
+            ).fetchone()
+        )
+        for parameter, p in differs.items()
     ]
 
 
@@ -195,12 +215,6 @@ def _known_cause(connection: Connection, twin: int, version: int, change: Change
     effects = [] if summary is None else orjson.loads(summary[0]).get("effects", [])
     has_it = any((e["effect"], e["where"]) == (cause["effect"], cause["where"]) for e in effects)
     return None if has_it else str(row[0])
-
-
-def open_ids(connection: Connection, twin: int, version: int | None) -> list[int]:
-    """Return the numbers of the anomalies of one model version that last."""
-    query = "SELECT id FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL ORDER BY id"
-    return [number for (number,) in connection.execute(query, (twin, version))]
 
 
 def open_kinds(connection: Connection, twin: int, version: int | None) -> dict[str, list[str]]:

@@ -11,6 +11,9 @@ from service.store.connection import Connection
 from service.store.errors import Missing
 from twin_core.telemetry import GAP_STEPS
 
+MOST_SIBLINGS = 50
+"""More of them tell hardly more of their family."""
+
 
 @dataclass(frozen=True)
 class ModelRow:
@@ -148,3 +151,17 @@ def first_us(connection: Connection, twin: int) -> int:
     """Return the first instant of a twin's archive, where the time axis of a new model begins; 0 if it is empty."""
     row = connection.execute("SELECT first_us FROM head WHERE twin = ?", (twin,)).fetchone()
     return int(row[0] or 0)
+
+
+def siblings(connection: Connection, family: str, but: str) -> dict[str, dict[str, Any]]:
+    """Return the active models of the other twins of a family, by the twin's name; at most ``MOST_SIBLINGS``, the newest."""
+    query = """SELECT twin.name, twin.specification, model.document
+               FROM twin JOIN activation ON activation.id = (SELECT max(id) FROM activation WHERE activation.twin = twin.id)
+               JOIN model ON model.twin = twin.id AND model.version = activation.version
+               WHERE twin.gone_us IS NULL AND twin.name <> ? AND twin.specification LIKE ? ORDER BY model.created_us DESC"""
+    named = f'%"family":{orjson.dumps(family).decode()}%'  # few are parsed that are of another one
+    found: dict[str, dict[str, Any]] = {}
+    for name, specification, document in connection.execute(query, (but, named)):
+        if len(found) < MOST_SIBLINGS and orjson.loads(specification).get("family") == family:
+            found[name] = orjson.loads(document)
+    return found

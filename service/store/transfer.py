@@ -50,6 +50,7 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             *("acknowledged_us", "note", "shelved_until_us"),
         ),
     ),
+    "vital": (("twin",), ("twin", "version", "time_us", "sensor", "residual_K", "deviations")),
     "watched": (("twin",), ("twin", "seq", "state")),
     "revision": (("twin", "number"), ("twin", "number", "at_us", "specification")),
     "audit": (("id",), ("id", "at_us", "who", "method", "path", "status", "client", "detail")),

@@ -43,6 +43,12 @@ class Entry:
         return self.spec.sensors
 
     @cached_property
+    def sensor_names(self) -> frozenset[str]:
+        """The same without an order, and without validating the specification, which of thousands takes seconds."""
+        declared = (node.get("sensor") or [] for node in self.specification["nodes"])
+        return frozenset(name for one in declared for name in ([one] if isinstance(one, str) else one))
+
+    @cached_property
     def limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Least and largest plausible value of each channel in its own unit, (n_channels, 1) each."""
         ranges = [plausible_range(self.spec.channels[name]) for name in self.channels]

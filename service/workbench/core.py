@@ -24,10 +24,14 @@ from service.workbench.interface import (
     Stretch,
     Telemetry,
 )
-from twin_core.errors import ModelError
+from twin_core.errors import ModelError, TwinError
 
 MOST_MODELS = 1024
 """So many models a worker process knows at a time, at some tens of kilobytes each."""
+
+LEAST_SIBLINGS = 3
+OWN = ""
+"""Among its siblings the model at hand goes by no name: twins have one."""
 
 
 class CoreWorkbench:
@@ -44,7 +48,8 @@ class CoreWorkbench:
         """Fit the declared network."""
         from twin_core.calibrate import calibrate
 
-        spec = _spec(task.specification)
+        siblings = {name: _model_of(document) for name, document in task.siblings.items()}
+        spec = _with_prior(_spec(task.specification), siblings)
         whole, telemetry = _screened(spec, task.telemetry)
         train, recent = telemetry.before(task.validation_us), telemetry.since(task.validation_us)
         model = calibrate(
@@ -62,7 +67,8 @@ class CoreWorkbench:
             "on": "recent data held back" if held else "the training data: too few to hold any back",
             "samples": int(recent.time_us.size),
         }
-        return _outcome(model, validation, rival)
+        outcome = _outcome(model, validation, rival)
+        return replace(outcome, extra=outcome.extra | _beside_family(model, siblings))
 
     def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
         """Close the loop."""
@@ -76,6 +82,7 @@ class CoreWorkbench:
             holdout=task.holdout,
             burn_in_s=task.burn_in_s,
             false_alarm_rate=task.false_alarm_rate,
+            first=[effect for document in task.siblings.values() for effect in _model_of(document).effects],
             progress=progress,
         )
         loop.report["document"] = {"date": datetime.now(UTC).date().isoformat()}
@@ -183,6 +190,40 @@ def _spec(specification: Json) -> Any:
     from twin_core.network.spec_io import load_spec
 
     return load_spec(specification)
+
+
+def _alike(spec: Any, siblings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the siblings that calibrated the parameters of a specification, no more and no fewer; none of under three."""
+    from twin_core.network.model import build_network
+
+    names = build_network(spec).parameters.free_names
+    found = {name: model for name, model in siblings.items() if model.free_names == names}
+    return found if len(found) >= LEAST_SIBLINGS else {}
+
+
+def _with_prior(spec: Any, siblings: Mapping[str, Any]) -> Any:
+    """Return a specification whose guesses are those of its family; as it is where too few siblings are known."""
+    from twin_core.family import declared, pool
+
+    alike = _alike(spec, siblings)
+    try:
+        return declared(spec, pool(alike)) if alike else spec
+    except (TwinError, np.linalg.LinAlgError):  # siblings that tell nothing must not stop a calibration
+        return spec
+
+
+def _beside_family(model: Any, siblings: Mapping[str, Any]) -> Json:
+    """Return how many siblings a model was compared with, and the p-values of the parameters in which it is unlike them."""
+    from twin_core.family import pool
+
+    alike = _alike(model.spec, siblings) if len(model.free_names) else {}
+    if not alike:
+        return {}
+    try:
+        own = pool({**alike, OWN: model}).members[OWN]
+    except (TwinError, np.linalg.LinAlgError):
+        return {}
+    return {"family": {"siblings": len(alike), "differs": own.differs}}
 
 
 def _record(spec: Any, telemetry: Telemetry) -> Any:

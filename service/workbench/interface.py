@@ -70,6 +70,8 @@ class CalibrationTask:
     validation_us: int
     method: str
     rival: Json | None = None
+    siblings: Mapping[str, Json] = field(default_factory=dict)
+    """Active models of other spacecraft of the design: they tell where parameters lie before any telemetry does."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,8 @@ class DiagnosisTask:
     holdout: float
     burn_in_s: float | None
     false_alarm_rate: float
+    siblings: Mapping[str, Json] = field(default_factory=dict)
+    """Active models of other spacecraft of the design: their effects are looked for first."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,9 @@ import pytest
 NOBODY = 65534
 """PostgreSQL refuses to run as root; then it runs as this user."""
 
+PATIENCE_S = 60.0
+"""How long a server may take to start, recover or die."""
+
 
 class NoPostgres(Exception):
     """There is none on this machine; the message says why."""
@@ -33,6 +36,11 @@ def _binaries() -> Path:
     return Path(spec.origin).parent / "pginstall" / "bin"
 
 
+def _is_open(place: Path) -> bool:
+    """Return whether every user may go there: a checkout in the home of root lies behind a closed door."""
+    return all(folder.stat().st_mode & 0o001 for folder in (place, *place.parents))
+
+
 class Postgres:
     """A server of our own, which a test may kill and start again."""
 
@@ -40,6 +48,9 @@ class Postgres:
         """Keep its files in a folder of its own below one that every user may enter."""
         self.binaries, self.folder, self._extra = _binaries(), folder, extra
         self._user = {"user": NOBODY, "group": NOBODY} if os.geteuid() == 0 else {}
+        if self._user and not _is_open(self.binaries):
+            self.binaries = folder.parent / "pginstall" / "bin"
+            shutil.copytree(_binaries().parent, self.binaries.parent, dirs_exist_ok=True)
         self.data = folder / "data"
         self.port = port or _free_port()
         self.process: subprocess.Popen[bytes] | None = None
@@ -79,23 +90,55 @@ class Postgres:
                 start_new_session=True,
                 **self._user,  # type: ignore[call-overload]
             )
-        for _ in range(200):
+        until_s = time.monotonic() + PATIENCE_S
+        while self.process.poll() is None and time.monotonic() < until_s:  # after a crash it recovers first
             with contextlib.suppress(psycopg.OperationalError), psycopg.connect(self.url, connect_timeout=2):
                 return self
             time.sleep(0.05)
-        raise NoPostgres("the server does not answer")
+        log_text = (self.folder.parent / f"{self.folder.name}.log").read_text()
+        raise NoPostgres(f"the server does not answer: {log_text[-500:]}")
 
     def kill(self) -> None:
-        """End it as a crash of the machine would."""
+        """End it as a crash of the machine would: with all its processes, each of which leads a group of its own.
+
+        Those that outlived the first one could still commit, and no other server may start beside them.
+        """
         if self.process is not None and self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGKILL)
+            os.kill(self.process.pid, signal.SIGSTOP)  # it starts no more of them
+            parts = _children(self.process.pid)
+            for pid in (*parts, self.process.pid):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
             self.process.wait()
+            until_s = time.monotonic() + PATIENCE_S
+            while any(_is_alive(pid) for pid in parts) and time.monotonic() < until_s:
+                time.sleep(0.01)
 
     def stop(self) -> None:
         """End it at once but in good order."""
         if self.process is not None and self.process.poll() is None:
             self.process.send_signal(signal.SIGINT)
             self.process.wait(30)
+
+
+def _children(pid: int) -> list[int]:
+    """Return the processes that a process has started and that still run."""
+    every = [int(place.name) for place in Path("/proc").glob("[0-9]*")]
+    return [child for child in every if (fields := _status(child)) and int(fields[1]) == pid]
+
+
+def _is_alive(pid: int) -> bool:
+    """Return whether a process still runs: one that nobody has waited for is as good as gone."""
+    fields = _status(pid)
+    return bool(fields) and fields[0] not in "ZX"
+
+
+def _status(pid: int) -> list[str]:
+    """Return what the kernel says of a process behind its name; nothing where it is gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return []
 
 
 def _free_port() -> int:

@@ -1,13 +1,12 @@
 """A wrong clock moves nothing, recordings of any time can be replayed, and what is in the archive by mistake can be taken out."""
 
-import sqlite3
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
 
@@ -248,7 +247,7 @@ def test_the_values_of_one_channel_can_go(client: AppClient) -> None:
     assert archive(client)["T_px"] == [*RAMP[:50], 300.0, *RAMP[51:]]
 
 
-def test_a_deletion_is_on_record(client: AppClient, tmp_path: Path) -> None:
+def test_a_deletion_is_on_record(client: AppClient, sql: Sql) -> None:
     filled(client)
     client.request("DELETE", f"{TWIN}/telemetry", params={"start": 50, "stop": 60})
     client.request("DELETE", f"{TWIN}/telemetry", params={"channels": "Q_px"})
@@ -257,24 +256,21 @@ def test_a_deletion_is_on_record(client: AppClient, tmp_path: Path) -> None:
         ("archive", 190, ["Q_px"]),
         ("archive", 10, None),
     ]
-    with sqlite3.connect(tmp_path / "twin.sqlite3") as database:
-        assert database.execute("SELECT count(*) FROM deletion").fetchone() == (2,)
+    assert sql("SELECT count(*) FROM deletion") == [(2,)]
 
 
-def test_after_a_day_a_deletion_is_for_ever(make_client, tmp_path: Path) -> None:
+def test_after_a_day_a_deletion_is_for_ever(make_client, sql: Sql) -> None:
     first = make_client(workbench=FakeWorkbench)
     first.post("/v1/twins", json=SPEC)
     send(first, [float(k) for k in range(20)])
     made = first.request("DELETE", f"{TWIN}/telemetry", params={"stop": 10}).json()
     first.close()
-    with sqlite3.connect(tmp_path / "twin.sqlite3") as database:
-        database.execute("UPDATE deletion SET at_us = at_us - 86401000000")
+    sql("UPDATE deletion SET at_us = at_us - 86401000000")
     later = make_client(workbench=FakeWorkbench)
     assert later.post(f"{TWIN}/telemetry/deletions/{made['id']}/undo").status_code == 409
     for _ in range(100):
-        with sqlite3.connect(tmp_path / "twin.sqlite3") as database:
-            if database.execute("SELECT count(*) FROM aside").fetchone() == (0,):
-                break
+        if sql("SELECT count(*) FROM aside") == [(0,)]:
+            break
         time.sleep(0.02)
     else:
         raise AssertionError("what was deleted is still there")

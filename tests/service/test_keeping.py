@@ -22,7 +22,7 @@ from service.monitoring.logs import JsonLines
 from service.running import dispatch
 from service.settings import SettingsError, read_settings
 from service.store.sqlite import migrations
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
 from tests.service.server import FAKE, Server
@@ -207,7 +207,7 @@ def test_webhooks_lead_somewhere(client: AppClient, url: str) -> None:
     assert client.post("/v1/webhooks", json={"url": url}).status_code == 422
 
 
-def test_silence_is_told_once_and_ends(registered: AppClient) -> None:
+def test_silence_is_told_once_and_ends(registered: AppClient, sql: Sql) -> None:
     service = registered.app.state.service
 
     async def look() -> None:
@@ -230,14 +230,9 @@ def test_silence_is_told_once_and_ends(registered: AppClient) -> None:
 
     registered.post(f"{TWIN}/telemetry", json={"time": [1, 2], "values": {"T_px": [290.0, 290.0]}})
     service.live._pulses.clear()
-    with sqlite3.connect(service.settings.database_path) as connection:  # as if it had been received long ago
-        connection.execute("UPDATE chunk SET received = time")
+    sql("UPDATE chunk SET received = time")  # as if it had been received long ago
     registered.portal.call(look)
-    with sqlite3.connect(service.settings.database_path) as connection:
-        rows = [
-            json.loads(body)
-            for (body,) in connection.execute("SELECT body FROM event WHERE type = 'stale' ORDER BY seq")
-        ]
+    rows = [json.loads(body) for (body,) in sql("SELECT body FROM event WHERE type = 'stale' ORDER BY seq")]
     assert [(row["state"], row["channels"]) for row in rows] == [("stale", ["T_px"]), ("live", ["T_px"])]
     assert rows[0]["text"].startswith("no telemetry of T_px for")
 

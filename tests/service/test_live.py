@@ -2,7 +2,6 @@
 
 import json
 import os
-import sqlite3
 import time
 from dataclasses import replace
 from itertools import pairwise
@@ -13,7 +12,7 @@ import pytest
 
 from service.stream import past
 from service.workbench.interface import Filtered, Json, Telemetry
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
 from tests.service.harness import AppClient
 
@@ -454,7 +453,7 @@ def test_an_anomaly_that_a_late_sample_refutes_is_gone(client: AppClient) -> Non
 
 
 def test_an_anomaly_is_told_when_it_opens_grows_or_closes_and_not_with_every_sample(
-    client: AppClient, tmp_path: Path
+    client: AppClient, sql: Sql
 ) -> None:
     lasting(client)
     for k in range(130, 200):
@@ -463,9 +462,9 @@ def test_an_anomaly_is_told_when_it_opens_grows_or_closes_and_not_with_every_sam
     (anomaly,) = client.get(f"{TWIN}/anomalies").json()["anomalies"]
     send(client, list(range(200, 500)), [0.0] * 300)
     residuals(client)
-    with sqlite3.connect(tmp_path / "twin.sqlite3") as database:
-        bodies = [row[0] for row in database.execute("SELECT body FROM event WHERE type = 'anomaly' ORDER BY seq")]
-    told = [json.loads(body)["anomaly"] for body in bodies]
+    told = [
+        json.loads(body)["anomaly"] for (body,) in sql("SELECT body FROM event WHERE type = 'anomaly' ORDER BY seq")
+    ]
     assert {row["id"] for row in told} == {anomaly["id"]}
     assert told[-1]["stop"] is not None and [row["stop"] for row in told[:-1]] == [None] * (len(told) - 1)
     scores = [row["score"] for row in told[:-1]]

@@ -1,7 +1,6 @@
 """What a twin needs that is kept for years: windows, bounds, exports, retention, deletion in pieces."""
 
 import io
-import sqlite3
 import time
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from service.jobs.executor import JobFailed, ProcessPerTask
 from service.store import retention, samples, selection
 from service.store.batch import Batch
 from service.store.database import Database
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, STORE, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
 from tests.service.test_jobs import finish
@@ -167,7 +166,7 @@ def test_answers_are_bounded_and_exports_are_whole(make_client: Any, monkeypatch
     assert client.get(f"{TWIN}/telemetry/export", params={"start": 1e9}).text == "time,T_px,T_tank,Q_px\r\n"
 
 
-def test_a_deleted_twin_goes_bit_by_bit_and_its_room_is_given_back(make_client: Any, tmp_path: Path) -> None:
+def test_a_deleted_twin_goes_bit_by_bit_and_its_room_is_given_back(make_client: Any, sql: Sql) -> None:
     client = make_client(FakeWorkbench)
     client.post("/v1/twins", json=SPEC)
     for first in range(0, 40_000, 2000):
@@ -179,22 +178,18 @@ def test_a_deleted_twin_goes_bit_by_bit_and_its_room_is_given_back(make_client: 
     assert client.post("/v1/twins", json=SPEC).status_code == 201
     assert client.get(TWIN).json()["samples"] == 0
     assert client.post(f"{TWIN}/telemetry", json={"time": [1], "values": {"T_px": [290.0]}}).json()["accepted"] == 1
-    reader = sqlite3.connect(tmp_path / "twin.sqlite3")
+    room = "SELECT 0" if STORE == "postgres" else "PRAGMA freelist_count"  # PostgreSQL gives it back by itself
     for _ in range(300):
-        rows = (
-            reader.execute("SELECT count(*) FROM twin").fetchone()[0],
-            reader.execute("PRAGMA freelist_count").fetchone()[0],
-        )
-        if rows == (1, 0):
+        rows = sql("SELECT count(*) FROM twin") + sql(room)
+        if rows == [(1,), (0,)]:
             break
         time.sleep(0.05)
-    assert rows == (1, 0)
+    assert rows == [(1,), (0,)]
     for table in ("chunk", "residual", "checkpoint", "job", "model"):
-        assert reader.execute(f"SELECT count(*) FROM {table} WHERE twin = 1").fetchone()[0] == 0
-    reader.close()
+        assert sql(f"SELECT count(*) FROM {table} WHERE twin = 1") == [(0,)]
 
 
-def test_residuals_take_less_room_than_the_archive_and_go_with_their_model(make_client: Any, tmp_path: Path) -> None:
+def test_residuals_take_less_room_than_the_archive_and_go_with_their_model(make_client: Any, sql: Sql) -> None:
     client = make_client(FakeWorkbench)
     client.post("/v1/twins", json=SPEC)
     for first in range(0, 9000, 3000):
@@ -202,17 +197,13 @@ def test_residuals_take_less_room_than_the_archive_and_go_with_their_model(make_
     for _ in range(3):
         calibrate(client, {"activate": True})
         assert client.get(f"{TWIN}/residuals").json()["samples"] == 9000
-    with sqlite3.connect(tmp_path / "twin.sqlite3") as reader:
-        size = "SELECT sum(length(seq) + length(time) + length(value)) FROM {} WHERE twin = 1"
-        archive = reader.execute(
-            size.format("chunk").replace("length(value)", "length(value) + length(received)")
-        ).fetchone()[0]
-        one = reader.execute(size.format("residual") + " AND version = 3").fetchone()[0]
-        assert one <= 0.75 * archive
-        while client.portal.call(client.app.state.service.database.write, retention.sweep_old):
-            pass
-        assert reader.execute(size.format("residual")).fetchone()[0] <= archive
-    reader.close()
+    size = "SELECT sum(length(seq) + length(time) + length(value)) FROM {} WHERE twin = 1"
+    ((archive,),) = sql(size.format("chunk").replace("length(value)", "length(value) + length(received)"))
+    ((one,),) = sql(size.format("residual") + " AND version = 3")
+    assert float(one) <= 0.75 * float(archive)
+    while client.portal.call(client.app.state.service.database.write, retention.sweep_old):
+        pass
+    assert sql(size.format("residual")) <= [(archive,)]
     assert client.get(f"{TWIN}/residuals").json()["samples"] == 9000
 
 

@@ -84,7 +84,10 @@ class Member:
         network = model.network()
         values = network.parameters.values
         own = values[network.capacity_index]
-        parts = None if network.capacities else couplings(network, values, _somewhere(network))
+        try:
+            parts = None if network.capacities else couplings(network, values, _somewhere(network))
+        except Exception:  # a term that cannot be evaluated just anywhere is left to the filter of one twin
+            parts = None
         if parts is None or parts.relays or parts.others:
             return cls(model, network, values, own, None, "", b"")
         parts = replace(parts, heat_W=np.zeros((0, own.size)))

@@ -1,6 +1,6 @@
 """Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
@@ -14,7 +14,7 @@ from twin_core.discover import policy
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.discover.told import least_score, score_needed
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
 from twin_core.simulate.rollout import hurried
 
@@ -98,6 +98,8 @@ class Search:
         What was not looked at for want of time.
     every
         Of how many samples of the training record the search looked at one.
+    first
+        Places of effects that spacecraft of the same design have: they are tried wherever they could matter.
     """
 
     trial: Trial
@@ -109,6 +111,7 @@ class Search:
     failures: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     every: int = 1
+    first: Collection[Place] = ()
 
     def fork(self) -> "Search":
         """Return a search that starts from here and shares what failed or was left out."""

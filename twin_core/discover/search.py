@@ -31,7 +31,7 @@ from twin_core.discover.judge import (
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
-from twin_core.effects.base import Effect, touched_nodes
+from twin_core.effects.base import Effect, Place, touched_nodes
 
 MAX_FINDINGS = 4
 N_REFITS = 12
@@ -55,7 +55,12 @@ N_FIRST = 2
 
 
 def search(
-    base: Trial, *, false_alarm_rate: float, deadline: float = NO_DEADLINE, progress: Progress = no_progress
+    base: Trial,
+    *,
+    false_alarm_rate: float,
+    deadline: float = NO_DEADLINE,
+    first: Collection[Place] = (),
+    progress: Progress = no_progress,
 ) -> Search:
     """Find the effects that a declared model lacks.
 
@@ -67,6 +72,8 @@ def search(
         Odds at which a finding on a healthy record is tolerated.
     deadline
         On the clock of ``time.monotonic``: what is not fitted by then is left out, and told.
+    first
+        Places of effects that spacecraft of the same design have.
     progress
         Called with the fraction done.
 
@@ -75,7 +82,7 @@ def search(
     Search
         With the findings in the order in which they were made.
     """
-    state = Search(base, base, deadline=deadline)
+    state = Search(base, base, deadline=deadline, first=first)
     needed = threshold(false_alarm_rate)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
@@ -146,7 +153,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool
         some = {probe.effect.place for ranked in rankings for probe in ranked[:N_FREE_PLACES] if probe.gain > needed}
         chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
     else:
-        chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS))
+        chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS, state.first))
     singles = [(effect,) for effect in chosen]
     if accept(state, _by_heat(state, singles, n_tried), needed):
         return True

@@ -8,7 +8,7 @@ from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover.confirm import Trial
 from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect, Survey
+from twin_core.effects.base import Effect, Place, Survey
 
 UNDECLARED_SHARES = (1.0, 0.1, 0.01)
 """Sizes of the undeclared heat at which candidates are screened, as shares of the fitted one."""
@@ -49,13 +49,17 @@ def screened(
     return screen_sizes(fit, shares, survey, effects)
 
 
-def shortlist(rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int) -> list[Effect]:
-    """Return the effects worth a refit: the best of every ranking in turn, each place once.
+def shortlist(
+    rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int, first: Collection[Place] = ()
+) -> list[Effect]:
+    """Return the effects worth a refit: those of the places ``first``, then the best of every ranking in turn, each place once.
 
     The first few places are joined by the other settings that the rankings prefer there: a set-point or a time constant
     is found by a local search, and one start may be caught.
     """
     chosen: dict[object, Effect] = {}
+    for probe in (p for ranked in rankings for p in ranked if p.effect.place in first and p.gain > needed):
+        chosen.setdefault(probe.effect.place, probe.effect)
     for rank in range(n_wanted):
         for ranked in rankings:
             if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:

@@ -21,6 +21,8 @@ from twin_core.parameters.transforms import Bounded, Identity, Log, Shifted, Tra
 from twin_core.units import format_instant
 
 Where = dict[str, Any]
+Place = tuple[str, frozenset[tuple[str, Any]]]
+"""Name and place of an effect as a key."""
 
 LEAST_SHARE = 0.1
 """A positive parameter that a linear response would push below this share of its null value starts there instead."""
@@ -296,7 +298,7 @@ class Effect(ABC):
         return cls.sentence.format(**names)
 
     @property
-    def place(self) -> tuple[str, frozenset[tuple[str, Any]]]:
+    def place(self) -> Place:
         """Name and place as a key; a pair of nodes has no order."""
         items = ((k, v if isinstance(v, str) else frozenset(v)) for k, v in self.where.items())
         return self.name, frozenset(items)

@@ -357,6 +357,8 @@ class TwinSpec(Strict):
     radiation: tuple[Radiation, ...] = ()
     heaters: tuple[Heater, ...] = ()
     derived: dict[Name, Derived] = Field(default_factory=dict)
+    family: Name | None = None
+    """What spacecraft of one design share: they know each other by it."""
 
     def __repr__(self) -> str:
         """Tell what it declares in one line."""

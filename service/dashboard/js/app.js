@@ -3,9 +3,10 @@ import { ApiError, call, follow, onKeyNeeded } from "./api.js";
 import { readAddress, writeAddress } from "./address.js";
 import { InputChart, ResidualChart, TemperatureChart, forecastLength } from "./charts.js";
 import { csvOf, save } from "./csv.js";
+import { Fleet } from "./fleet.js";
 import { clock, colour, count, isDark, make, seconds, span, toUnit, typed, unitName } from "./format.js";
 import { NetworkDrawing, declared } from "./network.js";
-import { drawAlarms, drawAnomalies, drawComparison, drawFleet, drawJobs, drawModels, drawNow } from "./panels.js";
+import { drawAlarms, drawAnomalies, drawComparison, drawJobs, drawModels, drawNow } from "./panels.js";
 import { PlanEditor } from "./plan.js";
 
 const $ = (id) => document.getElementById(id);
@@ -26,6 +27,7 @@ const temperatures = new TemperatureChart($("temperatures"), (ends) => zoomTo(en
 const inputs = new InputChart($("inputs"), (ends) => zoomTo(ends));
 const residuals = new ResidualChart($("residuals"), (ends) => zoomTo(ends));
 const drawing = new NetworkDrawing($("network"));
+const fleet = new Fleet($("fleet"), (twin) => select(twin));
 
 // ---- what is shown
 
@@ -463,21 +465,12 @@ function showFleet(is_on) {
     state.twin = null;
     $("facts").replaceChildren();
     $("link").dataset.state = "live";
-    $("link-text").textContent = `${state.twins.length} twins`;
+    $("link-text").textContent = `${count(state.twins.length)} twins`;
     keepAddress();
   }
-  $("fleet").hidden = !is_on;
   $("main").hidden = $("picker").hidden = is_on || !state.twins.length;
   $("to-fleet").hidden = is_on || state.twins.length < 2;
-  if (is_on) renderFleet();
-}
-
-function renderFleet() {
-  const focused = document.activeElement?.closest("#fleet-list button")?.querySelector("b")?.textContent;
-  drawFleet($("fleet-list"), state.twins, (twin) => select(twin));
-  [...$("fleet-list").querySelectorAll("button")].find((b) => b.querySelector("b").textContent === focused)?.focus();
-  const busy = state.twins.filter((t) => t.red || t.yellow || t.open_anomalies || t.state === "stale").length;
-  $("fleet-note").textContent = busy ? `${busy} of ${state.twins.length} ${busy === 1 ? "needs" : "need"} somebody` : `${state.twins.length} twins, nothing open`;
+  fleet.show(is_on);
 }
 
 function select(twin, view = {}) {
@@ -505,12 +498,11 @@ function select(twin, view = {}) {
 }
 
 async function findTwins() {
-  const { twins } = await call("v1/twins");
-  const names = twins.map((t) => t.id);
-  state.twins = twins;
+  const { twins: names } = await call("v1/fleet/names");
+  state.twins = names;
   $("empty").hidden = names.length > 0;
   $("to-fleet").hidden = state.fleet || names.length < 2;
-  if (state.fleet) renderFleet();
+  if (state.fleet) $("link-text").textContent = `${count(names.length)} twins`;
   else $("main").hidden = $("picker").hidden = names.length === 0;
   if ([...$("twin").options].map((o) => o.value).join() !== names.join()) {
     $("twin").replaceChildren(...names.map((name) => make("option", { value: name }, name)));

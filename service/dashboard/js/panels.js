@@ -28,7 +28,7 @@ export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies,
 
 const KINDS = {
   residual: "departs from its model", stuck: "is stuck", quantised: "reads in coarser steps", dropout: "does not report",
-  joint: "together depart from the model",
+  joint: "together depart from the model", family: "is unlike its family",
 };
 
 // What no anomaly means, by how the twin stands.
@@ -126,23 +126,4 @@ export function drawComparison(table, active, wanted) {
       row("Effects", (m) => m.effects.map(effectWords).join(", ") || "none")));
   const worse = active && active.error && wanted.error && wanted.error.rmse_K > active.error.rmse_K;
   return worse ? `Version ${wanted.version} is ${number((wanted.error.rmse_K / active.error.rmse_K - 1) * 100, 0)} % worse than the active one` : "";
-}
-
-const STANDING = { live: ["", "live"], delayed: ["", "arrives late"], partly: ["warn", "some sensors silent"], stale: ["warn", "silent"], never: ["unknown", "no telemetry yet"] };
-
-// Every twin at a glance, what needs an operator first.
-export function drawFleet(list, twins, onPick) {
-  const rank = (t) => [t.red, t.yellow, t.open_anomalies, t.state === "stale" || t.state === "partly" ? 1 : 0];
-  const worse = (a, b) => rank(b).reduce((found, v, i) => found || v - rank(a)[i], 0) || (a.id < b.id ? -1 : 1);
-  list.replaceChildren(...[...twins].sort(worse).map((t) => {
-    const [look, words] = STANDING[t.state];
-    const state = t.red ? "bad" : t.yellow || t.open_anomalies ? "warn" : look;
-    const chips = [[t.red, "bad", "red"], [t.yellow, "warn", "yellow"], [t.open_anomalies, "warn", t.open_anomalies === 1 ? "anomaly" : "anomalies"]];
-    return make("li", {}, make("button", { class: "twin", onclick: () => onPick(t.id) },
-      make("div", { class: "row" }, make("span", { class: `state ${state}`, role: "img", "aria-label": words }), make("b", {}, t.id), make("span", { class: "sub" }, words)),
-      make("div", { class: "chips" }, ...chips.filter(([n]) => n).map(([n, c, name]) => make("span", { class: `chip ${c}` }, `${n} ${name}`)),
-        t.active_model === null ? make("span", { class: "chip" }, "no model") : make("span", { class: "chip" }, `model v${t.active_model}`),
-        t.quarantined ? make("span", { class: "chip warn" }, `${count(t.quarantined)} in quarantine`) : null),
-      make("div", { class: "sub" }, `${count(t.samples)} samples${t.last_time ? ` · last ${clock(seconds(t.last_time))}` : ""}`)));
-  }));
 }

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Response
 
 from service.http.deps import Running, reads
 from service.monitoring.metrics import CONTENT_TYPE
-from service.store import twins, watch
+from service.store import fleet, twins
 
 router = APIRouter(tags=["health"])
 
@@ -26,5 +26,5 @@ async def ready(service: Running) -> dict[str, str]:
 async def metrics(service: Running) -> Response:
     """Return the metrics in the text format of Prometheus."""
     service.metrics.backlog.set(service.database.backlog)
-    service.metrics.show(await service.database.read(watch.select))
+    service.metrics.show(await service.database.read(fleet.glances))
     return Response(service.metrics.render(), media_type=CONTENT_TYPE)

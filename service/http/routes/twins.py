@@ -1,7 +1,8 @@
 """Twins: register, list, inspect, delete."""
 
+import contextlib
 from dataclasses import asdict
-from typing import Any, Literal
+from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
@@ -23,9 +24,9 @@ from service.schemas import (
     TwinGlance,
     TwinList,
 )
-from service.store import anomalies, models, retention, twins, watch
+from service.store import anomalies, fleet, models, retention, twins
 from service.store.connection import Connection
-from service.store.errors import Missing, TwinGone
+from service.store.errors import Missing
 from service.store.twins import Twin
 from service.twins.fit import lacks
 from service.twins.registry import Entry
@@ -105,30 +106,17 @@ async def register(service: Running, response: Response, request: Request) -> Tw
 @router.get("", dependencies=[reads])
 async def list_twins(service: Running) -> TwinList:
     """List every twin with what is open and whether its telemetry is live."""
-    vitals = {one.twin: one for one in await service.database.read(watch.select)}
-    found = []
+    glances = {one.name: one for one in await service.database.read(fleet.glances)}
+    listed = []
     for twin in await service.database.read(twins.select):
-        one = vitals.get(twin.name)
-        counts = {} if one is None else {"open_anomalies": one.open_anomalies, "yellow": one.yellow, "red": one.red}
-        found.append(TwinGlance(**_info(twin) | counts | {"state": await _state(service, twin.name)}))
+        with contextlib.suppress(Missing, KeyError):  # it is being deleted, or was registered just now
+            listed.append((twin, glances[twin.name], service.registry.get(twin.name)))
+    states = await service.live.standings([entry for _, _, entry in listed])
+    found = []
+    for (twin, one, _), (state, _) in zip(listed, states, strict=True):
+        counts = {"open_anomalies": one.open_anomalies, "yellow": one.yellow, "red": one.red}
+        found.append(TwinGlance(**_info(twin) | counts | {"state": state}))
     return TwinList(twins=found)
-
-
-async def _state(service: Service, name: str) -> Literal["live", "delayed", "stale", "partly", "never"]:
-    """Return how the sensors of a twin stand, all of them together."""
-    try:
-        entry = service.registry.get(name)
-        beats, at_us = await service.live.beats(entry), now_us()
-    except (Missing, TwinGone):  # it is being deleted
-        return "never"
-    states = {beats[sensor].standing(at_us) for sensor in entry.sensors}
-    if states <= {"never"}:
-        return "never"
-    if states <= {"stale", "never"}:
-        return "stale"
-    if "stale" in states:
-        return "partly"
-    return "delayed" if "delayed" in states else "live"
 
 
 @router.get("/{twin}", dependencies=[reads])

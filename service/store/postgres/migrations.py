@@ -256,6 +256,17 @@ FLEET = """
         'SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS BIGINT)';
 """
 
+VITALS = """
+    CREATE TABLE vital (
+        twin BIGINT PRIMARY KEY REFERENCES twin(id) ON DELETE CASCADE,
+        version INTEGER NOT NULL,
+        time_us BIGINT NOT NULL,
+        sensor TEXT NOT NULL,
+        residual_K DOUBLE PRECISION NOT NULL,
+        deviations DOUBLE PRECISION NOT NULL
+    ) WITH (fillfactor = 50);
+"""
+
 
 def _statements(script: str) -> list[str]:
     return [statement for statement in script.split(";\n") if statement.strip()]
@@ -272,6 +283,7 @@ STEPS: tuple[tuple[str, list[str]], ...] = (
         ],
     ),
     ("fleet", _statements(FLEET)),
+    ("vitals", _statements(VITALS)),
 )
 
 

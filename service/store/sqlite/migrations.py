@@ -299,6 +299,23 @@ def _workers(connection: Connection) -> None:
     )
 
 
+def _vitals(connection: Connection) -> None:
+    """Add the worst of the newest residuals of each twin."""
+    _run(
+        connection,
+        """
+        CREATE TABLE vital (
+            twin INTEGER PRIMARY KEY REFERENCES twin(id) ON DELETE CASCADE,
+            version INTEGER NOT NULL,
+            time_us INTEGER NOT NULL,
+            sensor TEXT NOT NULL,
+            residual_K REAL NOT NULL,
+            deviations REAL NOT NULL
+        );
+        """,
+    )
+
+
 STEPS: tuple[tuple[str, Step], ...] = (
     ("twins and samples", _twins_and_samples),
     ("models and jobs", _models_and_jobs),
@@ -308,6 +325,7 @@ STEPS: tuple[tuple[str, Step], ...] = (
     ("alarms", _alarms),
     ("years", _years),
     ("workers", _workers),
+    ("vitals", _vitals),
 )
 
 

@@ -82,6 +82,15 @@ class Load:
         """How many samples were acknowledged so far, of all twins together."""
         return sum(self.sent.values())
 
+    def until(self, is_so: Callable[[], bool], wait_s: float = 60.0) -> None:
+        """Return once something is so."""
+        end_s = time.monotonic() + wait_s
+        while not is_so():
+            assert time.monotonic() < end_s, (
+                f"{self.acknowledged} acknowledged, {self.refused} refused, {self.wrong[:1]}"
+            )
+            time.sleep(0.05)
+
     def _send(self, own: list[str]) -> None:
         turn = 0
         with httpx.Client(timeout=10.0, trust_env=False) as client:

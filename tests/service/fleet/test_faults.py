@@ -62,12 +62,15 @@ def test_the_database_is_killed(tmp_path: Path) -> None:
         with fleet(tmp_path, [server.url] * 2) as services:
             load = Load(lambda: [s.url for s in services], TWINS)
             time.sleep(4)
+            before = load.acknowledged
             server.kill()
-            time.sleep(3)
+            load.until(lambda: load.refused > 0)  # the outage is noticed, however slow the machine is
             server.start()
-            time.sleep(10)
+            during = load.acknowledged
+            load.until(lambda: load.acknowledged > during)
+            time.sleep(5)
             load.end()
-            assert load.refused > 0
+            assert load.refused > 0 and load.acknowledged > during >= before > 0
             assert_nothing_lost(server.url, load)
 
 
