@@ -165,7 +165,7 @@ def live(bridge: YamcsBridge, config: YamcsConfig, gateway: YamcsGateway, rows: 
 
 def main() -> None:
     """Measure, print and save."""
-    results = [measure(n_nodes, 1000, 40) for n_nodes in (2, 10, 20)]
+    results = [measure(n_nodes, 3000, 60) for n_nodes in (2, 10, 20)]
     rates = markdown_table(
         [
             "sensors",
@@ -180,7 +180,7 @@ def main() -> None:
         ["sensors", "samples", "median, ms", "95 %, ms", "longest, ms"], [delay for _, delay in results]
     )
     note = (
-        "Rates: the archive of 1000 samples through the bridge into an empty twin (log-in, reading back and health included); "
+        "Rates: the archive of 3000 samples through the bridge into an empty twin (log-in, reading back and health included); "
         "residuals, forecasts and events of all of them back; what the parameter stream takes by itself; the same with one "
         "request per value. Delay: from a sample being sent to Yamcs to its residual being heard from Yamcs, through the "
         "bridge (`--poll 0.1`), the service's commit and its filter; one sample every 0.5 s, which is twenty times as fast as "

@@ -29,7 +29,7 @@ from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
 from twin_core.report.build import build_report
-from twin_core.report.dossier import provenance
+from twin_core.report.dossier import Moment, check_moments, provenance
 from twin_core.report.mistakes import told_mistakes
 from twin_core.report.plots import build_plots
 from twin_core.telemetry import Record, cut_at_gaps
@@ -66,6 +66,7 @@ def close_loop(
     burn_in_s: float | None = None,
     false_alarm_rate: float = 0.01,
     deadline_s: float | None = None,
+    moments: Sequence[Moment] = (),
     first: Collection[Effect] = (),
     progress: Progress = no_progress,
 ) -> ClosedLoop:
@@ -87,6 +88,9 @@ def close_loop(
         Tolerated rate of findings on healthy records, between 0 and 1.
     deadline_s
         Seconds after which the search ends with the best answer so far; none by default.
+    moments
+        Instants and phases of the training telemetry at which the report tells heat flows; by default the average, the
+        hottest and the coldest moment of its last segment.
     first
         Effects that spacecraft of the same design have: at their places they are tried wherever they could matter.
     progress
@@ -119,6 +123,7 @@ def close_loop(
             deadline,
             latest,
             begun,
+            moments,
             first,
             progress,
         )
@@ -134,6 +139,7 @@ def _close_loop(
     deadline: float,
     latest: float,
     begun: float,
+    moments: Sequence[Moment],
     first: Collection[Effect],
     progress: Progress,
 ) -> ClosedLoop:
@@ -145,6 +151,7 @@ def _close_loop(
     records = [screened(spec, record) for record in records]
     holdout_records = [screened(spec, record) for record in holdout_records or ()]
     train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
+    check_moments(train, moments)
     fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
     before = to_model(calibration, ())
     whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
@@ -160,7 +167,7 @@ def _close_loop(
     after = _corrected_or(before, whole, found) if found.findings else before
     progress(0.88, "predicting the hold-out")
     predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
-    report = build_report(found, before, after, held, predictions, verdict_of(found))
+    report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
     progress(0.93, "drawing")
     witness = bear_witness(found, deadline=latest)
     report |= told_by(witness, report)

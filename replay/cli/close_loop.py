@@ -11,6 +11,7 @@ from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
     from twin_core.closed_loop import ClosedLoop
+    from twin_core.report.dossier import Moment
 
 VERDICTS = {
     "effect_added": "an undeclared effect was found and added",
@@ -48,6 +49,12 @@ VERDICTS = {
 @click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
+@click.option(
+    "--flows-at",
+    multiple=True,
+    metavar="TIME[/TIME]",
+    help="An instant or a phase of the training telemetry for the heat-flow map; may be repeated.",
+)
 @click.option("--author", default="", help="Who signs the report: printed on it.")
 @click.option("--pdf", is_flag=True, help="Print the report too, as report.pdf; needs Chromium or Chrome.")
 @effects_option
@@ -64,6 +71,7 @@ def close_loop(
     deadline: float | None,
     no_masking: bool,
     out: Path,
+    flows_at: tuple[str, ...],
     author: str,
     pdf: bool,
     as_json: bool,
@@ -107,6 +115,7 @@ def close_loop(
             burn_in_s=burn_in,
             false_alarm_rate=false_alarm_rate,
             deadline_s=deadline,
+            moments=[_moment(text) for text in flows_at],
             progress=progress,
         )
     loop.report["document"] = document(author, [spec_file, *telemetry, *holdout_telemetry])
@@ -120,6 +129,20 @@ def close_loop(
     else:
         print_report(loop.report)
         print_line(f"wrote {out}/report.html, {'report.pdf, ' if pdf else ''}report.json, model.json")
+
+
+def _moment(text: str) -> "Moment":
+    """Return an instant, or a phase written as ISO 8601 writes intervals, in the form of the telemetry."""
+    ends = [part.strip() for part in text.split("/")]
+    if len(ends) > 2 or not all(ends):
+        raise click.UsageError(f"--flows-at must be TIME or TIME/TIME (got '{text}')")
+    found: list[str | float] = []
+    for end in ends:
+        try:
+            found.append(float(end))
+        except ValueError:
+            found.append(end)
+    return found[0], found[-1]
 
 
 def _check(

@@ -73,7 +73,7 @@ def correlate(
     from twin_core.calibrate.phases import correlate as run
     from twin_core.files import make_folder, write_text
     from twin_core.network.spec_io import load_spec
-    from twin_core.report.dossier import provenance, sensitivity
+    from twin_core.report.dossier import limits, provenance, sensitivity
     from twin_core.report.html import render
 
     if not (steady or transient):
@@ -90,10 +90,12 @@ def correlate(
     report["sensitivity"] = sensitivity(found.calibration)
     report["provenance"] = provenance(spec, [phase.record for phase in phases])
     report["document"] = document(author, [spec_file, *steady, *transient])
+    drawn = limits(spec, found.model.noise_K)
+    plots = {"criteria": spec.criteria.model_dump(), "phases": found.plots, "limits": drawn}
     make_folder(out)
     write_text(out / "model.json", to_json(found.model.to_json()))
     write_text(out / "report.json", to_json(report))
-    write_text(out / "report.html", render(report, {"criteria": spec.criteria.model_dump()}))
+    write_text(out / "report.html", render(report, plots))
     if pdf:
         as_pdf(out / "report.html", out / "report.pdf")
     notify(report["notices"])

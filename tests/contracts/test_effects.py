@@ -125,6 +125,14 @@ def declared_heat_W(effect: Effect, survey: Survey) -> np.ndarray:
 
 
 @each_effect
+def test_an_effect_adds_unknowns_and_takes_none_away(kind: type[Effect]) -> None:
+    """What it does is asked with it and without it, at the same values of all else."""
+    declared = set(every_term_network().parameters.free_names)
+    for effect in some(null_effects(kind)):
+        assert declared <= set(every_term_network([effect]).parameters.free_names)
+
+
+@each_effect
 def test_its_name_is_its_key_and_it_explains_itself(kind: type[Effect]) -> None:
     assert REGISTRY[kind.name] is kind
     assert re.fullmatch(r"[a-z]+(_[a-z]+)*", kind.name)

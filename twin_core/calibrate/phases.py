@@ -28,6 +28,8 @@ SETTLED = 20.0
 is gone, were it slower by a factor of three."""
 SAMPLES_AT_REST = (50, 2000)
 """Fewest and most samples that stand for a phase at rest; in between it counts as much as the longest transient."""
+MOST_DRAWN = 3000
+"""Samples of a transient in a picture."""
 LONGEST_S = 1e9
 """A time constant beyond that is none: the network has no way to lose heat."""
 
@@ -53,11 +55,12 @@ class Phase:
 
 @dataclass(frozen=True, repr=False)
 class Correlation:
-    """A model correlated with several phases, and how well it meets each of them."""
+    """A model correlated with several phases, how well it meets each of them, and what is drawn of transients."""
 
     model: CalibratedModel
     calibration: Calibration
     report: Json
+    plots: Json
 
     def __repr__(self) -> str:
         """Tell what came of it in one line."""
@@ -207,7 +210,28 @@ def correlate(
         "words": [line for line in model.summary["words"] if "never changes" not in line],
         "notices": model.summary["notices"],
     }
-    return Correlation(model, calibration, report)
+    plots = {
+        phase.name: _series(spec, phase, measured[i], {when: tables[when][i] for when in tables})
+        for i, phase in enumerate(phases)
+        if not phase.steady
+    }
+    return Correlation(model, calibration, report, plots)
+
+
+def _series(spec: TwinSpec, phase: Phase, measured_K: FloatArray, tables: Mapping[str, FloatArray]) -> Json:
+    """Return what a transient's pictures are drawn from: readings and both models by sensor, thinned evenly where many."""
+    rows = np.unique(np.linspace(0, measured_K.shape[0] - 1, min(measured_K.shape[0], MOST_DRAWN)).round().astype(int))
+    named = {"measured": measured_K, **tables}
+    columns = {
+        sensor: {
+            name: [float(v) if np.isfinite(v) else None for v in table[rows, i].tolist()]
+            for name, table in named.items()
+        }
+        for i, sensor in enumerate(spec.sensors)
+        if np.isfinite(measured_K[:, i]).any()
+    }
+    record = phase.record
+    return {"ends": [record.present(record.time_s[0]), record.present(record.time_s[-1])], "sensors": columns}
 
 
 def _with_noise(spec: TwinSpec, transients: list[Record]) -> TwinSpec:

@@ -94,19 +94,28 @@ def search(
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
         withdraw(state, needed)
-    if not state.findings:
-        _name_what_is_nearly_a_law(state)
-        withdraw(state, needed)
+        _name_what_is_nearly_a_law(state, needed)
     return state
 
 
-def _name_what_is_nearly_a_law(state: Search) -> None:
-    """Where nothing else is supported, name the likeliest option that was refused for what little a coarse network leaves."""
+def _name_what_is_nearly_a_law(state: Search, needed: float) -> None:
+    """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
+
+    If it stands, and is likelier than the heat without a name that was found instead.
+    """
     near = [j for j in state.rejected if j.reason == NEARLY_A_LAW and len(j.trial.effects) == len(j.effects)]
-    if near:
-        best = min(near, key=worth)
-        state.findings, state.trial = [Finding(replace(best, reason=""))], best.trial
-        state.rejected = [j for j in state.rejected if j.effects != best.effects]
+    if not near:
+        return
+    best = min(near, key=worth)
+    rest = [j for j in state.rejected if j.effects != best.effects]
+    named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
+    withdraw(named, needed)
+    if named.findings and _worth_of_all(named) < _worth_of_all(state):
+        state.join(named)
+
+
+def _worth_of_all(state: Search) -> float:
+    return sum(worth(finding.judged) for finding in state.findings)
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:

@@ -44,7 +44,7 @@ def least_score(simple: Trial, rich: Trial) -> float:
     known = {effect.place for effect in simple.effects}
     others = [[e for e in rich.effects if e is not own] for own in rich.effects if own.place not in known]
     problems = [extended(simple.fit.problem, rest) if rest else simple.fit.problem for rest in others]
-    return min(_score(calibration, covariance, problem) for problem in problems)
+    return min((_score(calibration, covariance, problem) for problem in problems), default=np.inf)
 
 
 def _score(rich: Calibration, covariance: FloatArray, without: Problem) -> float:

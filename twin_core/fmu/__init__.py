@@ -16,9 +16,10 @@ from twin_core._typing import Json
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.errors import ModelError
-from twin_core.fmu.terms import Names, boundary_changes, formula, heats, reading_offsets
+from twin_core.fmu.terms import Names, boundary_changes, extra_capacities, formula, heats, reading_offsets
 from twin_core.network.formula import channels_of, is_dated
 from twin_core.network.model import Network
+from twin_core.network.thermostat import UNSETTLED, ThermostatHeat
 from twin_core.units import parse_instant_ns
 
 RUNTIME = Path(__file__).parent / "c"
@@ -32,6 +33,11 @@ static double fourth(double x) { return x * x * x * x; }
 static double ramp(double clock, double onset, double width) {
     return fmin(fmax((clock - onset) / width + 0.5, 0.0), 1.0);
 }
+
+/* A straight line that bends into a hyperbola below its least share, and stays positive. */
+static double bent(double line, double least) { return line < least ? least / (2.0 - line / least) : line; }
+
+static double bell(double x, double width) { return exp(-0.5 * x * x / (width * width)) / (width * 2.5066282746310002); }
 
 static double convection(double k, double power, double d, double rounding) {
     return k * d * exp(0.5 * (power - 1.0) * log(d * d + rounding * rounding));
@@ -91,12 +97,15 @@ class _Plan:
         own = self.network.parameters.as_dict()
         return own if self.epoch_s is None else own | {EPOCH: self.epoch_s}
 
+    @property
+    def relays(self) -> tuple[ThermostatHeat, ...]:
+        """Thermostats, in the order of the network's terms."""
+        return tuple(term for term in self.network.terms if isinstance(term, ThermostatHeat))
+
 
 def _plan(model: CalibratedModel) -> _Plan:
     """Return what a model's unit holds; ModelError where part of it has no form in C."""
     network, spec = model.network(), model.spec
-    if network.capacities:
-        raise ModelError("a capacity that depends on temperature has no form in C yet")
     wanted = {load.channel for load in spec.loads} | {load.factor for load in spec.loads if load.factor is not None}
     wanted |= {b.channel for b in spec.boundaries.values() if b.channel is not None}
     wanted |= {str(effect.where["channel"]) for effect in model.effects if "channel" in effect.where}
@@ -124,14 +133,20 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
     """
     plan = _plan(model)
     network, spec, names = plan.network, model.spec, plan.names
-    parameters = plan.parameters
+    parameters, relays = plan.parameters, plan.relays
     n, unit_of = len(network.nodes), {name: channel.unit for name, channel in spec.channels.items()}
     header = [
         f'#define TOKEN "{_token(model)}"',
         f"enum {{ N_STATES = {n}, N_INPUTS = {len(plan.inputs)}, N_OUTPUTS = {len(spec.sensors)},"
-        f" N_PARAMETERS = {len(parameters)}, N_BOUNDARIES = {len(spec.boundaries)}, N_CHANNELS = {len(names.inputs)} }};",
+        f" N_PARAMETERS = {len(parameters)}, N_BOUNDARIES = {len(spec.boundaries)}, N_CHANNELS = {len(names.inputs)},"
+        f" N_RELAYS = {len(relays)} }};",
+        f"#define UNSETTLED {UNSETTLED!r}",
+        "/* Of a thermostat: states of its node and its memory, thresholds among the parameters, what the memory is. */",
+        "typedef struct { int node, memory, on, off; double on_K, off_K; } Relay;",
+        "extern const Relay network_relays[];",
         "extern const double network_start[], network_inputs[], network_parameters[];",
-        "void network_rates(double time, const double *T, const double *inputs, const double *p, double *rates);",
+        "void network_rates(double time, const double *T, const double *inputs, const double *p, const double *share,"
+        " double *rates);",
         "void network_outputs(double time, const double *T, const double *p, double *outputs);",
     ]
     clock = "time" if plan.epoch_s is None else f"time + p[{names.parameters[EPOCH]}]"
@@ -155,7 +170,9 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
     body += [f"    {line}" for line in heats(network, model.effects, names)]
     index = network.capacity_index
     ordered = list(network.parameters.index)
-    body += [f"    rates[{i}] = Q[{i}] / p[{names.parameters[ordered[int(k)]]}];" for i, k in enumerate(index)]
+    more = extra_capacities(network, names)
+    own = [f"p[{names.parameters[ordered[int(k)]]}]" for k in index]
+    body += [f"    rates[{i}] = Q[{i}] / ({own[i]}{more.get(i, '')});" for i in range(n)]
     offsets = reading_offsets(network, names)
     outputs = [f"    double clock = {clock};", "    (void)clock;"]
     for i, (sensor, node) in enumerate(zip(spec.sensors, network.sensor_node.tolist(), strict=True)):
@@ -169,8 +186,10 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
         _array("network_start", [START_K] * n),
         _array("network_inputs", [_rest(spec.channels[c].unit) if c in spec.channels else 0.0 for c in plan.inputs]),
         _array("network_parameters", list(parameters.values())),
+        f"const Relay network_relays[] = {{{', '.join([_relay(relay, names) for relay in relays] + ['{0}'])}}};",
         "",
-        "void network_rates(double time, const double *T, const double *inputs, const double *p, double *rates) {",
+        "void network_rates(double time, const double *T, const double *inputs, const double *p, const double *share,"
+        " double *rates) {",
         *body,
         "}",
         "",
@@ -179,6 +198,12 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
         "}",
     ]
     return {"network.h": "\n".join(header) + "\n", "network.c": "\n".join(text) + "\n"}
+
+
+def _relay(relay: ThermostatHeat, names: Names) -> str:
+    on, off = (names.parameters[parameter.name] for parameter in relay.parameters[1:])
+    memory = relay.memory
+    return f"{{{relay.node}, {relay.state}, {on}, {off}, {memory.on_K!r}, {memory.off_K!r}}}"
 
 
 def _reachable(text: str, names: Names) -> bool:
@@ -225,8 +250,16 @@ def variables(model: CalibratedModel) -> list[Variable]:
     units = {p.name: p.unit for p in network.parameters.parameters} | {EPOCH: "s"}
     fixed = 'causality="parameter" variability="fixed" initial="exact" start="{!r}"'
     told += [Variable(name, fixed.format(float(value)), units[name]) for name, value in plan.parameters.items()]
-    assert len(told) == 1 + 2 * n + len(plan.inputs) + len(spec.sensors) + len(plan.parameters)
+    indicator = 'causality="local" variability="continuous" initial="calculated"'
+    told += [Variable(name, indicator, "K") for name in indicators(plan)]
+    assert len(told) - 2 * len(plan.relays) == 1 + 2 * n + len(plan.inputs) + len(spec.sensors) + len(plan.parameters)
     return told
+
+
+def indicators(plan: _Plan) -> list[str]:
+    """Return the names of the event indicators: how far each thermostat is from being called on, and off."""
+    names = [plan.network.nodes[relay.state] for relay in plan.relays]
+    return [f"{name}.{side}" for name in names for side in ("to_on", "to_off")]
 
 
 def model_description(model: CalibratedModel) -> str:
@@ -245,6 +278,8 @@ def model_description(model: CalibratedModel) -> str:
     structure += [f'    <ContinuousStateDerivative valueReference="{1 + n + i}"/>' for i in range(n)]
     structure += [f'    <InitialUnknown valueReference="{1 + n + i}"/>' for i in range(n)]
     structure += [f'    <InitialUnknown valueReference="{first_output + i}"/>' for i in range(len(spec.sensors))]
+    first_indicator = len(told) - len(indicators(_plan(model)))
+    structure += [f'    <EventIndicator valueReference="{i}"/>' for i in range(first_indicator, len(told))]
     common = f'modelIdentifier="{name}" canGetAndSetFMUState="true"'
     return "\n".join(
         [

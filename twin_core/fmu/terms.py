@@ -8,9 +8,11 @@ from typing import Any
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects.base import Effect
 from twin_core.effects.boundary_offset import Offset
+from twin_core.effects.capacity_temperature import LEAST_SHARE, LinearCapacity
 from twin_core.effects.constant_heat_load import ConstantHeat
 from twin_core.effects.heat_load_step import SteppedHeat
 from twin_core.effects.inputs import InputCorrection
+from twin_core.effects.latent_heat import Melting
 from twin_core.effects.missing_conductor import PairConductor
 from twin_core.effects.nonlinear_convection import ROUNDING_K, PowerConvection
 from twin_core.effects.periodic_heat_load import PeriodicHeat
@@ -32,6 +34,7 @@ from twin_core.network.terms import (
     TableLoad,
     Term,
 )
+from twin_core.network.thermostat import ThermostatHeat
 from twin_core.units import parse_instant_ns
 
 SIGMA = f"{STEFAN_BOLTZMANN_W_PER_M2_K4!r}"
@@ -72,12 +75,15 @@ def heats(network: Network, effects: Sequence[Effect], names: Names) -> Iterator
     """
     added = [(effect, term) for effect in effects for term in effect.addition(network.layout).terms]
     declared = network.terms[: len(network.terms) - len(added)]
-    for term in declared:
-        yield from _heat(
-            term, names, "a declared thermostat" if "Thermostat" in type(term).__name__ else "a declared term", ""
-        )
-    for effect, term in added:
-        yield from _heat(term, names, f"the effect {effect.label}", effect.name)
+    told = [(term, "a declared term", "") for term in declared]
+    told += [(term, f"the effect {effect.label}", effect.name) for effect, term in added]
+    relay = 0
+    for term, what, effect in told:
+        if isinstance(term, ThermostatHeat):  # its memory changes at events alone
+            yield f"Q[{term.node}] += {names.p(term)[0]} * share[{relay}];"
+            relay += 1
+        else:
+            yield from _heat(term, names, what, effect)
 
 
 def _heat(term: Term, names: Names, what: str, effect: str) -> Iterator[str]:
@@ -136,6 +142,22 @@ _CORRECTIONS: dict[str, Callable[[str, list[str]], str]] = {
     "input_gain": lambda u, p: f"{p[0]} - 1.0",
 }
 """Effects on inputs -> the factor of what is delivered beyond the declared heat."""
+
+
+def extra_capacities(network: Network, names: Names) -> dict[int, str]:
+    """Return node -> what it stores beyond its own capacity, in J/K, as C."""
+    found: dict[int, str] = {}
+    for term in network.capacities:
+        p = names.p(term)
+        match term:
+            case LinearCapacity(node=a, reference_K=reference):
+                more = f"{p[1]} * (bent(1.0 + {p[0]} * (T[{a}] - {reference!r}), {LEAST_SHARE!r}) - 1.0)"
+            case Melting(node=a):
+                more = f"{p[0]} * bell(T[{a}] - {p[1]}, {p[2]})"
+            case _:
+                raise ModelError(f"a capacity ({type(term).__name__}) has no form in C yet; use the twin itself")
+        found[term.node] = found.get(term.node, "") + f" + {more}"
+    return found
 
 
 def boundary_changes(network: Network, names: Names) -> Iterator[str]:

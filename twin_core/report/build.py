@@ -14,7 +14,7 @@ from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects.base import Effect
 from twin_core.holdout import HeldOut, Prediction
-from twin_core.report.dossier import ensemble, heat_flow_maps, left_out, sensitivity
+from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out, sensitivity
 from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
 
@@ -183,6 +183,7 @@ def build_report(
     held: Sequence[HeldOut],
     predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
     verdict: str,
+    moments: Sequence[Moment] = (),
 ) -> Json:
     """Return the report of a closed loop (contract section 6).
 
@@ -198,6 +199,8 @@ def build_report(
         Open-loop predictions of both models over it.
     verdict
         ``effect_added``, ``no_effect_supported`` or ``unexplained``.
+    moments
+        Of the training telemetry, at which heat flows are told.
     """
     sensors = before.spec.sensors
     scores = [with_met(before.spec, held_out_scores(sensors, p)) for p in predictions]
@@ -241,7 +244,7 @@ def build_report(
         if after.free_names
         else [],
         "sensitivity": attempted(lambda: sensitivity(search.trial.calibration()), "sensitivity matrix", failures) or {},
-        "heat_flows": attempted(lambda: heat_flow_maps(search, after), "heat flows", failures) or [],
+        "heat_flows": attempted(lambda: heat_flow_maps(search, after, moments), "heat flows", failures) or [],
         "excluded": left_out(before.spec),
         "failures": list(dict.fromkeys(search.failures)),
         "search": {

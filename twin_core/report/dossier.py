@@ -3,7 +3,7 @@
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
@@ -15,6 +15,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import spread_of
 from twin_core.discover.judge import Search
+from twin_core.errors import TelemetryError
 from twin_core.flows import flows_along
 from twin_core.holdout import Prediction
 from twin_core.network.dynamics import fill_boundaries
@@ -93,35 +94,74 @@ def sensitivity(calibration: Calibration) -> Json:
     return {"sensors": list(problem.network.spec.sensors), "rows": rows}
 
 
-def heat_flow_maps(search: Search, after: CalibratedModel) -> list[Json]:
-    """Return the heat flows of the corrected model on the last training segment: on average, at its hottest, at its coldest.
+Moment = tuple[str | float, str | float]
+"""Begin and end of a phase in the telemetry's own form; an instant where both are the same."""
 
-    Each is what ``flows.flows_along`` returns, the largest links first and those beyond ``MOST_LINKS`` only counted, with
-    ``phase`` in words and ``start`` and ``stop`` in the telemetry's own form.
+
+def check_moments(records: Sequence[Record], moments: Sequence[Moment]) -> None:
+    """Refuse moments that do not lie within one record; TelemetryError names the first."""
+    for start, stop in moments:
+        inside = False
+        for record in records:
+            if record.epoch_ns is not None and not (isinstance(start, str) and isinstance(stop, str)):
+                raise TelemetryError(f"heat flows at {start}: {record.name} is dated; write a date")
+            first_s, last_s = record.locate_s(start), record.locate_s(stop)
+            inside |= record.time_s[0] <= first_s <= last_s <= record.time_s[-1]
+        if not inside:
+            spans = ", ".join(f"{r.present(r.time_s[0])} to {r.present(r.time_s[-1])}" for r in records)
+            said = f"{start}" if start == stop else f"{start} to {stop}"
+            raise TelemetryError(f"heat flows at {said}: no segment of the training telemetry holds it ({spans})")
+
+
+def heat_flow_maps(search: Search, after: CalibratedModel, moments: Sequence[Moment] = ()) -> list[Json]:
+    """Return the heat flows of the corrected model at moments of the training telemetry, or else of its last segment.
+
+    Without ``moments``: on average over the last segment, at its hottest and at its coldest. Each map is what
+    ``flows.flows_along`` returns, the largest links first and those beyond ``MOST_LINKS`` only counted, with ``phase`` in
+    words and ``start`` and ``stop`` in the telemetry's own form.
     """
     calibration = search.trial.calibration()
-    network, segment = calibration.network, calibration.problem.segments[-1]
-    forcing, stages = segment.forcing, calibration.optimum.fit.trajectories[-1].stages_K
-    values, record = network.parameters.values, segment.record
-    if not np.isfinite(stages).all():
+    segments = calibration.problem.segments
+    if not np.isfinite(calibration.optimum.fit.trajectories[-1].stages_K).all():
         return []
-    sensed = stages[:, 1, network.sensor_node].mean(axis=1)
-    spans = [("on average over the last training segment", 0, forcing.n_steps)]
-    for words, step in (("hottest moment", int(sensed.argmax())), ("coldest moment", int(sensed.argmin()))):
-        spans.append((f"{words} of it, by the mean of the sensors", step, step + 1))
-    maps = []
-    for words, first, last in spans:
-        boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
-        along = forcing.along(stages[first:last].reshape(-1, stages.shape[2]), boundaries, first, last)
-        weights = np.repeat(forcing.step_s[first:last], 2)
-        start = forcing.stage_time_s[first, 0]
-        stop = forcing.stage_time_s[last - 1, 1] if last - first > 1 else start
-        told = {"phase": words, "start": record.present(start), "stop": record.present(stop)}
-        flows = flows_along(after, network, along, weights)
-        flows["links"].sort(key=lambda link: -abs(link["heat_W"]))
-        told["links_left_out"] = max(len(flows["links"]) - MOST_LINKS, 0)
-        maps.append(told | flows | {"links": flows["links"][:MOST_LINKS]})
-    return maps
+    spans = [span for moment in moments for span in _spans_of(calibration, moment)]
+    if not moments:
+        last = len(segments) - 1
+        stages = calibration.optimum.fit.trajectories[last].stages_K
+        sensed = stages[:, 1, calibration.network.sensor_node].mean(axis=1)
+        spans = [("on average over the last training segment", last, 0, segments[last].forcing.n_steps)]
+        for words, step in (("hottest moment", int(sensed.argmax())), ("coldest moment", int(sensed.argmin()))):
+            spans.append((f"{words} of it, by the mean of the sensors", last, step, step + 1))
+    return [_map(calibration, after, *span) for span in spans]
+
+
+def _spans_of(calibration: Calibration, moment: Moment) -> Iterator[tuple[str, int, int, int]]:
+    """Yield the segment of a moment and its steps, the first of them and the one after the last."""
+    start, stop = moment
+    for number, segment in enumerate(calibration.problem.segments):
+        begin_s, end_s = segment.record.locate_s(start), segment.record.locate_s(stop)
+        if not segment.record.time_s[0] <= begin_s <= end_s <= segment.record.time_s[-1]:
+            continue
+        ends_s = segment.forcing.stage_time_s[:, 1]
+        first = min(int(np.searchsorted(ends_s, begin_s)), ends_s.size - 1)
+        last = min(int(np.searchsorted(ends_s, end_s)), ends_s.size - 1)
+        yield ("chosen moment" if start == stop else "on average over the chosen phase"), number, first, last + 1
+        return
+
+
+def _map(calibration: Calibration, after: CalibratedModel, words: str, number: int, first: int, last: int) -> Json:
+    """Return the flows over steps of a segment."""
+    network, segment = calibration.network, calibration.problem.segments[number]
+    forcing, stages = segment.forcing, calibration.optimum.fit.trajectories[number].stages_K
+    boundaries = fill_boundaries(network, network.parameters.values, forcing.boundaries_flat_K(first, last))
+    along = forcing.along(stages[first:last].reshape(-1, stages.shape[2]), boundaries, first, last)
+    start = forcing.stage_time_s[first, 0]
+    stop = forcing.stage_time_s[last - 1, 1] if last - first > 1 else start
+    told = {"phase": words, "start": segment.record.present(start), "stop": segment.record.present(stop)}
+    flows = flows_along(after, network, along, np.repeat(forcing.step_s[first:last], 2))
+    flows["links"].sort(key=lambda link: -abs(link["heat_W"]))
+    told["links_left_out"] = max(len(flows["links"]) - MOST_LINKS, 0)
+    return told | flows | {"links": flows["links"][:MOST_LINKS]}
 
 
 def left_out(spec: TwinSpec) -> list[Json]:

@@ -13,6 +13,7 @@ from twin_core import __version__
 from twin_core._typing import FloatArray, Json
 from twin_core.report import phrasing
 from twin_core.report.network_picture import draw_flows, draw_network
+from twin_core.report.phase_pictures import phase_pictures
 from twin_core.report.residual_picture import draw_residuals
 from twin_core.units import format_instant
 
@@ -53,6 +54,7 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         sensitivity=_sensitivity(report),
         residuals=_residuals(plots),
         flows=_flows(report),
+        phases=phase_pictures(report, plots, plots.get("criteria") or {}),
         document=report.get("document") or {},
         provenance=report.get("provenance") or {},
         evidence=_evidence(report),

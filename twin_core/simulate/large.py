@@ -75,7 +75,7 @@ def march_sensitivities_of_many(
     """Advance d state / d column along a trajectory without relays.
 
     Arguments and result as of ``march_sensitivities``, but ``turning`` is (n_turned, n, n) dA between nodes: a coupling changes
-    four of its entries, so that thousands of columns cost no more memory than A does.
+    four of its entries, which are taken one by one where they are few.
     """
     n_steps, (n, n_columns) = step_s.size, start.shape
     out = np.empty((sample_step.size, observed.size, n_columns))

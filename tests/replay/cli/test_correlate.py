@@ -1,6 +1,7 @@
 """The command line on balance phases: what it prints, what it leaves, and what it refuses."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,11 @@ def test_phases_are_correlated_and_told(
     assert len(report["document"]["files"]) == 3 and report["sensitivity"]["rows"]
     page = (out / "report.html").read_text()
     assert "A. Body" in page and "Mean deviation of each sensor" in page and "nan" not in page.split("<script")[0]
+    drawn = re.findall(r'<svg class="residuals deviations".*?</svg>', page)
+    assert [drawing.count('circle class="after"') for drawing in drawn] == [2, 2, 2]  # three phases of two sensors
+    assert "Residuals in flown" in page and "Residuals in hot" not in page
+    (flown,) = re.findall(r"<h3>Residuals in flown</h3>(.*?)</section>", page, re.DOTALL)
+    assert flown.count('<svg class="residuals"') == 2 and flown.count('class="bar after"') == 2
     assert json.loads((out / "model.json").read_text())["values"]["C:a"] == pytest.approx(TRUTH["C:a"], rel=0.05)
 
 

@@ -1,13 +1,16 @@
 """A file of an earlier release is brought up to date where it stands."""
 
+import contextlib
 import sqlite3
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import orjson
+import psycopg
 import pytest
 
+from service.store.database import Database
 from service.store.sqlite import migrations
 from tests.service.conftest import SPEC
 
@@ -52,3 +55,27 @@ def test_an_old_archive_is_read_written_deleted_and_compacted(old_file: Path, ma
     client.close()
     with sqlite3.connect(old_file) as connection:
         assert connection.execute("SELECT count(*) FROM chunk").fetchone()[0] < 64
+
+
+def test_both_databases_have_the_same_columns(tmp_path: Path, postgres: str) -> None:
+    """Each has steps of its own: SQLite files lived through all of them, PostgreSQL began with the fleet."""
+    kinds = {"INTEGER": "whole", "bigint": "whole", "integer": "whole", "REAL": "real", "double precision": "real"}
+    kinds |= {"TEXT": "text", "text": "text", "BLOB": "bytes", "bytea": "bytes"}
+    path = tmp_path / "new.sqlite3"
+    Database(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as file:
+        ours = {
+            (table, name, kinds[kind], bool(required or key))
+            for (table,) in file.execute(
+                "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+            )
+            for _, name, kind, required, _, key in file.execute(f"PRAGMA table_info({table})")
+            if table != "migration"
+        }
+    Database(postgres).close()
+    query = """SELECT table_name, column_name, data_type, is_nullable = 'NO' FROM information_schema.columns
+               WHERE table_schema = current_schema() AND table_name <> 'migration'"""
+    with psycopg.connect(postgres) as server:
+        theirs = {(table, name, kinds[kind], required) for table, name, kind, required in server.execute(query)}
+    of_fleet = {row for row in theirs if row[0] in ("member", "slot", "tenure") or row[:2] == ("head", "epoch")}
+    assert of_fleet and ours == theirs - of_fleet

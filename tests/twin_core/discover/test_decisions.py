@@ -351,20 +351,25 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
 
 
-def test_what_is_nearly_a_law_is_named_where_nothing_else_is() -> None:
+@pytest.mark.parametrize(("found", "names"), [(None, ["a"]), (90.0 - JUST, ["a"]), (90.0, ["f"])])
+def test_what_is_nearly_a_law_is_named_where_nothing_likelier_is_found(found: float | None, names: list[str]) -> None:
     state = Search(stub(), stub())
+    if found is not None:
+        state.findings = [Finding(judged("f", found))]
     likely, less = (replace(judged(node, nats), reason=NEARLY_A_LAW) for node, nats in (("a", 90.0), ("b", 60.0)))
     state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
-    _name_what_is_nearly_a_law(state)
-    assert [f.effects[0].where["node"] for f in state.findings] == ["a"] and state.trial is likely.trial
-    assert [j.effects[0].where["node"] for j in state.rejected] == ["c", "b"]
+    _name_what_is_nearly_a_law(state, NEEDED)
+    assert [f.effects[0].where["node"] for f in state.findings] == names
+    named = names == ["a"]
+    assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
+    assert (state.trial is likely.trial) == named
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
     state = Search(stub(), stub())
     option = judged("a", 90.0)
     state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=NEARLY_A_LAW)]
-    _name_what_is_nearly_a_law(state)
+    _name_what_is_nearly_a_law(state, NEEDED)
     assert not state.findings
 
 

@@ -97,11 +97,35 @@ def flight(dt_s: float = 600.0, n: int = 40) -> Record:
 START_K = np.array([295.0, 288.0, 279.0, 288.0, 288.0])
 
 
-def rolled_out(model: CalibratedModel, record: Record, step_s: float) -> tuple[FloatArray, FloatArray]:
+SWITCHED: list[dict[str, Any]] = [
+    {"node": "a", "thermostat": {"on_K": 287.0, "off_K": 287.5, "power_W": {"value": 45.0}}}
+]
+STORING: list[dict[str, Any]] = [
+    {
+        "effect": "capacity_temperature",
+        "where": {"node": "a"},
+        "values": {"kappa_per_K": 4e-3},
+        "settings": {"T_ref_K": 290.0},
+    },
+    {"effect": "latent_heat", "where": {"node": "b"}, "values": {"L_J": 1.5e5, "T_m_K": 287.0, "w_K": 0.7}},
+    {
+        "effect": "thermostat_heater",
+        "where": {"node": "a"},
+        "values": {"Q_W": 60.0, "T_on_K": 286.7, "T_off_K": 287.3},
+        "settings": {"off_state_K": 286.7, "on_state_K": 287.3, "rate_K_per_s": 1e-3, "delay_s": 0.5},
+    },
+]
+STORED_K = np.array([288.0, 288.0, 279.0, 287.0, 286.7])
+"""Where the nodes begin, and the memories of both thermostats: off."""
+
+
+def rolled_out(
+    model: CalibratedModel, record: Record, step_s: float, start_K: FloatArray = START_K
+) -> tuple[FloatArray, FloatArray]:
     """Return states (n_samples, n_states) and readings in K."""
     network = model.network()
     forcing = build_forcing(network, record, step_s)
-    path = rollout(network, network.parameters.values, START_K, forcing)
+    path = rollout(network, network.parameters.values, start_K, forcing)
     assert path.converged
     states = path.at_samples(forcing.sample_step)
     offsets = reading_offsets_K(network, network.parameters.values, record.clock_s)
@@ -138,7 +162,7 @@ def set_inputs(instance: Any, at: dict[str, int], record: Record, k: int) -> Non
 def test_co_simulation_is_the_rollout() -> None:
     """Against a rollout whose steps are so short that halving them changes it by less than what is asked."""
     model, record = make_model(), flight()
-    (states, readings), (coarser, _) = rolled_out(model, record, 0.25), rolled_out(model, record, 0.5)
+    (states, readings), (coarser, _) = rolled_out(model, record, 0.5), rolled_out(model, record, 1.0)
     assert np.abs(states - coarser).max() < 1e-6
     with unit(model, "cs") as (instance, at, _):
         instance.setFloat64([at[f"node.{n}"] for n in model.network().nodes], START_K.tolist())
@@ -159,7 +183,7 @@ def test_co_simulation_is_the_rollout() -> None:
 def test_model_exchange_is_the_rollout() -> None:
     """Its rates, integrated by SciPy."""
     model, record = make_model(), flight(n=12)
-    states, _ = rolled_out(model, record, 0.25)
+    states, _ = rolled_out(model, record, 0.5)
     with unit(model, "me") as (instance, at, _):
         instance.enterInitializationMode(startTime=0.0)
         instance.exitInitializationMode()
@@ -181,6 +205,91 @@ def test_model_exchange_is_the_rollout() -> None:
             state = solve_ivp(rates, span, state, method="DOP853", rtol=1e-12, atol=1e-9).y[:, -1]
             np.testing.assert_allclose(state, states[k + 1], atol=1e-6)
         instance.terminate()
+
+
+def test_thermostats_and_capacities_that_change_are_the_rollout() -> None:
+    """Co-simulation finds every switching by itself; the memories, which a rollout lets settle, are where they settle."""
+    model, record = make_model(STORING, {"heaters": SWITCHED}), flight(n=24)
+    (states, _), (coarser, _) = (rolled_out(model, record, step, STORED_K) for step in (0.5, 1.0))
+    assert np.abs(states - coarser)[:, :3].max() < 1e-6
+    switched = [np.count_nonzero(np.diff(states[:, k] > STORED_K[k] + 0.25)) for k in (3, 4)]
+    assert min(switched) >= 2 and sum(switched) >= 5  # between samples; within them there are more
+    with unit(model, "cs") as (instance, at, _):
+        names = [at[f"node.{n}"] for n in model.network().nodes]
+        instance.setFloat64(names, STORED_K.tolist())
+        instance.enterInitializationMode(startTime=0.0)
+        instance.exitInitializationMode()
+        found = [STORED_K]
+        for k in range(record.time_s.size - 1):
+            set_inputs(instance, at, record, k)
+            step = float(record.time_s[k + 1] - record.time_s[k])
+            instance.doStep(currentCommunicationPoint=float(record.time_s[k]), communicationStepSize=step)
+            found.append(np.array(instance.getFloat64(names)))
+        instance.terminate()
+    assert np.abs(np.array(found) - states)[:, :3].max() < 1e-6
+    np.testing.assert_allclose(np.array(found)[:, 3:], states[:, 3:], atol=0.1)
+
+
+def test_events_of_a_thermostat_are_found_by_their_indicators() -> None:
+    """SciPy integrates between events, ends at a zero of an indicator, and asks the unit to switch."""
+    strong = [{"node": "a", "thermostat": SWITCHED[0]["thermostat"] | {"power_W": {"value": 120.0}}}]
+    model, record = make_model([], {"heaters": strong}), flight(n=12)
+    start_K = STORED_K[:4]
+    states, _ = rolled_out(model, record, 0.5, start_K)
+    with unit(model, "me") as (instance, at, described):
+        names = [at[f"node.{n}"] for n in model.network().nodes]
+        instance.setFloat64(names, start_K.tolist())
+        instance.enterInitializationMode(startTime=0.0)
+        instance.exitInitializationMode()
+        instance.enterContinuousTimeMode()
+        n, n_indicators = start_K.size, described.numberOfEventIndicators
+        assert n_indicators == 2
+
+        def place(time_s: float, state_K: FloatArray) -> None:
+            instance.setTime(float(time_s))
+            instance.setContinuousStates((fmpy.fmi3.fmi3Float64 * n)(*state_K.tolist()), n)
+
+        def rates(time_s: float, state_K: FloatArray) -> FloatArray:
+            place(time_s, state_K)
+            told = (fmpy.fmi3.fmi3Float64 * n)()
+            instance.getContinuousStateDerivatives(told, n)
+            return np.array(told)
+
+        def indicator(which: int) -> Any:
+            def falls(time_s: float, state_K: FloatArray) -> float:
+                place(time_s, state_K)
+                told = (fmpy.fmi3.fmi3Float64 * n_indicators)()
+                instance.getEventIndicators(told, n_indicators)
+                return float(told[which])
+
+            falls.terminal, falls.direction = True, -1.0  # type: ignore[attr-defined]
+            return falls
+
+        state, events = start_K, 0
+        for k in range(record.time_s.size - 1):
+            set_inputs(instance, at, record, k)
+            now, stop = float(record.time_s[k]), float(record.time_s[k + 1])
+            while now < stop:
+                part = solve_ivp(
+                    rates,
+                    (now, stop),
+                    state,
+                    method="DOP853",
+                    rtol=1e-12,
+                    atol=1e-9,
+                    events=[indicator(0), indicator(1)],
+                )
+                now, state = float(part.t[-1]), part.y[:, -1]
+                if part.status == 1:
+                    place(now, state)
+                    instance.enterEventMode()
+                    assert instance.updateDiscreteStates()[3]  # the memory has changed
+                    events += 1
+                    instance.enterContinuousTimeMode()
+                    state = np.array(instance.getFloat64(names))
+            np.testing.assert_allclose(state[:3], states[k + 1, :3], atol=1e-6)
+        instance.terminate()
+    assert events >= 2
 
 
 def test_a_state_is_kept_and_restored_and_a_parameter_changed() -> None:
@@ -218,12 +327,17 @@ def test_stiff_nodes_cost_no_short_steps() -> None:
 
 
 def test_what_has_no_form_is_refused_by_name() -> None:
-    heater = [{"node": "c", "thermostat": {"on_K": 280.0, "off_K": 282.0, "power_W": {"value": 5.0}}}]
-    with pytest.raises(ModelError, match="thermostat"):
-        c_source(make_model([], {"heaters": heater}))
-    latent = {"effect": "latent_heat", "where": {"node": "a"}, "values": {"L_J": 1e4, "T_m_K": 290.0, "w_K": 1.0}}
-    with pytest.raises(ModelError, match="capacity"):
-        c_source(make_model([latent]))
+    drift = {
+        "effect": "input_drift",
+        "where": {"channel": "Q"},
+        "values": {"r_per_s": 1e-6},
+        "settings": {"t0_s": 0.0, "dated": False},
+    }
+    with pytest.raises(ModelError, match="input_drift"):
+        c_source(make_model([drift]))
+    lag = {"effect": "boundary_lag", "where": {"boundary": "room"}, "values": {"tau_s": 300.0}}
+    with pytest.raises(ModelError, match="boundary"):
+        c_source(make_model([lag]))
 
 
 def test_the_same_model_is_the_same_unit() -> None:

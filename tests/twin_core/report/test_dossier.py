@@ -1,14 +1,19 @@
 """What a report to sign holds, against what can be worked out by hand."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from twin_core.calibrate.second_order import fit_trajectories
+from twin_core.calibrate.second_order import fit_trajectories, to_model
 from twin_core.calibrate.statistics import spread_of
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
+from twin_core.errors import TelemetryError
 from twin_core.holdout import Prediction
 from twin_core.network.spec_io import load_spec
-from twin_core.report.dossier import histograms, provenance, sensitivity
+from twin_core.report.dossier import Moment, check_moments, heat_flow_maps, histograms, provenance, sensitivity
 from twin_core.report.html import render
 from twin_core.report.network_picture import draw_flows
 from twin_core.report.residual_picture import draw_residuals
@@ -45,6 +50,33 @@ def test_sensitivity_at_rest_is_that_of_ohms_law() -> None:
     assert rows["G:a|room"]["rms_K"][0] == pytest.approx(10.0 * np.log(1.1), rel=0.05)
     assert rows["C:a"]["rms_K"][0] < 0.02
     assert rows["G:a|room"]["change"] == "+10%"
+
+
+def test_heat_flows_at_chosen_moments_are_those_of_the_load() -> None:
+    """A node that has settled passes on what it is given: 20 W, then 60 W, and 40 W on average over both."""
+    slow_s = 4_000.0
+    time_s = np.arange(0.0, 20.0 * slow_s, 100.0)
+    heat = np.where(time_s < 10.0 * slow_s, 20.0, 60.0)
+    temperature = np.where(time_s < 10.0 * slow_s, 300.0, 320.0 - 20.0 * np.exp(-(time_s - 10.0 * slow_s) / 450.0))
+    noise = np.random.default_rng(3).normal(0.0, 0.05, time_s.size)
+    record = Record(time_s, {"T": temperature + noise, "Q": heat}, name="steps")
+    fit = fit_trajectories(SPEC, [record])
+    search: Any = SimpleNamespace(trial=SimpleNamespace(calibration=lambda: fit))
+    moments: list[Moment] = [(8.0 * slow_s, 8.0 * slow_s), (18.0 * slow_s, 18.0 * slow_s), (0.0, 20.0 * slow_s - 100.0)]
+    check_moments([record], moments)
+    early, late, mean = heat_flow_maps(search, to_model(fit, ()), moments)
+    for found, watt in ((early, 20.0), (late, 60.0)):
+        (link,), (load,) = found["links"], found["loads"]
+        assert load["heat_W"] == pytest.approx(watt) and abs(link["heat_W"]) == pytest.approx(watt, abs=0.05)
+        assert found["phase"] == "chosen moment" and found["start"] == found["stop"]
+    assert mean["loads"][0]["heat_W"] == pytest.approx(40.0, abs=0.2) and mean["phase"].endswith("chosen phase")
+    assert [found["start"] for found in (early, late)] == pytest.approx([8.0 * slow_s, 18.0 * slow_s], abs=100.0)
+    with pytest.raises(TelemetryError, match=r"heat flows at 90000.0: no segment .* \(0.0 to 79900.0\)"):
+        check_moments([record], [(9e4, 9e4)])
+    with pytest.raises(TelemetryError, match="counts seconds"):
+        check_moments([record], [("2026-03-01T00:00:00Z", "2026-03-01T00:00:00Z")])
+    with pytest.raises(TelemetryError, match="is dated; write a date"):
+        check_moments([replace(record, epoch_ns=0)], [(5.0, 5.0)])
 
 
 def test_quantiles_of_a_known_spread() -> None:

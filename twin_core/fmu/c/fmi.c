@@ -1,6 +1,6 @@
 /* The functions of FMI 3.0 for Model Exchange and Co-Simulation around the heat balance of network.c.
    Every variable is a Float64 whose value reference is its position in `value`:
-   time, states, their derivatives, inputs, outputs, parameters. */
+   time, states, their derivatives, inputs, outputs, parameters, event indicators. */
 
 #include "fmi3Functions.h"
 #include "network.h"
@@ -9,23 +9,82 @@
 #include <string.h>
 
 enum { STATES = 1, RATES = STATES + N_STATES, INPUTS = RATES + N_STATES, OUTPUTS = INPUTS + N_INPUTS };
-enum { PARAMETERS = OUTPUTS + N_OUTPUTS, N_VARIABLES = PARAMETERS + N_PARAMETERS };
+enum { PARAMETERS = OUTPUTS + N_OUTPUTS, INDICATORS = PARAMETERS + N_PARAMETERS };
+enum { N_INDICATORS = 2 * N_RELAYS, N_VARIABLES = INDICATORS + N_INDICATORS };
 
 typedef struct {
     double value[N_VARIABLES];
     double tolerance, step; /* K per step of the integrator, and the step that it would take next */
     int known;              /* whether derivatives and outputs belong to the other values */
+    double share[N_RELAYS + 1]; /* of full power that each thermostat has: 1 on, 0 off, or what its memory began with */
 } Instance;
 
 /* C arrays of no elements are not allowed: every vector has one more than it needs. */
 static void rates_at(const Instance *m, double time, const double *states, double *rates) {
-    network_rates(time, states, m->value + INPUTS, m->value + PARAMETERS, rates);
+    network_rates(time, states, m->value + INPUTS, m->value + PARAMETERS, m->share, rates);
+}
+
+/* ---- Thermostats: a margin below zero calls one on (the first) or off (the second). */
+
+static const double CLOSE_K = 1e-9; /* nearer to a threshold than this is at it */
+
+static void margins(const Instance *m, int k, const double *states, double *margin) {
+    const Relay *relay = network_relays + k;
+    margin[0] = states[relay->node] - m->value[PARAMETERS + relay->on];
+    margin[1] = m->value[PARAMETERS + relay->off] - states[relay->node];
+}
+
+/* Switch what lies at or beyond a threshold; return whether anything was switched. */
+static int switch_relays(Instance *m, double *states) {
+    int any = 0;
+    for (int k = 0; k < N_RELAYS; k++) {
+        double margin[2], share = m->share[k];
+        margins(m, k, states, margin);
+        if (margin[0] <= CLOSE_K) share = 1.0;
+        else if (margin[1] <= CLOSE_K) share = 0.0;
+        if (share == m->share[k]) continue;
+        m->share[k] = share;
+        states[network_relays[k].memory] = share == 1.0 ? network_relays[k].on_K : network_relays[k].off_K;
+        m->known = 0;
+        any = 1;
+    }
+    return any;
+}
+
+/* Let every thermostat be as its memory says, unless its temperature says otherwise. */
+static void recall(Instance *m) {
+    for (int k = 0; k < N_RELAYS; k++) {
+        double off = network_relays[k].off_K, on = network_relays[k].on_K;
+        double remembered = m->value[STATES + network_relays[k].memory];
+        double share = (1.0 + UNSETTLED) * (remembered - off) / (on - off) - 0.5 * UNSETTLED;
+        m->share[k] = fmin(fmax(share, 0.0), 1.0);
+    }
+    m->known = 0;
+    switch_relays(m, m->value + STATES);
+}
+
+/* Return how far, in K, states lie beyond a threshold that has not switched yet; not above zero: beyond none. */
+static double beyond(const Instance *m, const double *states) {
+    double farthest = -1e300;
+    for (int k = 0; k < N_RELAYS; k++) {
+        double margin[2];
+        margins(m, k, states, margin);
+        if (m->share[k] != 1.0) farthest = fmax(farthest, -margin[0]);
+        if (m->share[k] != 0.0) farthest = fmax(farthest, -margin[1]);
+    }
+    return farthest;
 }
 
 static void refresh(Instance *m) {
     if (m->known) return;
     rates_at(m, m->value[0], m->value + STATES, m->value + RATES);
     network_outputs(m->value[0], m->value + STATES, m->value + PARAMETERS, m->value + OUTPUTS);
+    for (int k = 0; k < N_RELAYS; k++) {
+        double *indicator = m->value + INDICATORS + 2 * k;
+        margins(m, k, m->value + STATES, indicator);
+        if (m->share[k] == 1.0) indicator[0] = 1.0; /* what is on is not called on again: no event */
+        if (m->share[k] == 0.0) indicator[1] = 1.0;
+    }
     m->known = 1;
 }
 
@@ -157,12 +216,54 @@ static double attempt(const Instance *m, double time, double h, Work *w) {
     return worst;
 }
 
+/* Return the part of the step from w->begin to w->now, h long, after which a thermostat's node lies farthest beyond its
+   threshold: 1 at the end, less where it turned round on the way (a cubic through both ends and their slopes tells). */
+static double farthest_part(const Instance *m, double time, double h, Work *w) {
+    double part = 1.0, most = beyond(m, w->now);
+    rates_at(m, time + h, w->now, w->rate);
+    for (int k = 0; k < N_RELAYS; k++) {
+        int node = network_relays[k].node;
+        double begin = h * w->first[node], end = h * w->rate[node], gap = w->now[node] - w->begin[node];
+        if (begin * end >= 0.0) continue;
+        double low = 0.0, high = 1.0, before[2];
+        for (int i = 0; i < 40; i++) {
+            double s = 0.5 * (low + high);
+            double slope = begin * (1.0 - s) * (1.0 - 3.0 * s) + end * s * (3.0 * s - 2.0) + 6.0 * gap * s * (1.0 - s);
+            if (slope * begin > 0.0) low = s;
+            else high = s;
+        }
+        double r = 1.0 - low;
+        double moved = gap * low * low * (3.0 - 2.0 * low) + begin * low * r * r - end * low * low * r;
+        margins(m, k, w->begin, before);
+        double past = moved < 0.0 ? -(before[0] + moved) : -(before[1] - moved);
+        if (m->share[k] == (moved < 0.0 ? 1.0 : 0.0) || past <= fmax(most, CLOSE_K)) continue;
+        part = low;
+        most = past;
+    }
+    return part;
+}
+
+/* Shorten the step from w->begin, h long, so that it ends at the first threshold on its way; return its length. */
+static double shorten(const Instance *m, double time, double h, Work *w) {
+    double low = 0.0, high = h, past = beyond(m, w->now);
+    while (past > CLOSE_K && high - low > 1e-14 * fabs(time + high)) {
+        double middle = 0.5 * (low + high);
+        attempt(m, time, middle, w);
+        double there = beyond(m, w->now);
+        if (there > 0.0) high = middle, past = there;
+        else low = middle;
+    }
+    attempt(m, time, high, w);
+    return high;
+}
+
 static fmi3Status march(Instance *m, double stop) {
     Work w;
     if (!allocate(&w)) return fmi3Error;
     double time = m->value[0], least = 1e-13 * fmax(fabs(stop), stop - time);
     fmi3Status status = fmi3OK;
     memcpy(w.begin, m->value + STATES, N_STATES * sizeof(double));
+    switch_relays(m, w.begin);
     double h = m->step > 0.0 ? m->step : (stop - time) / 16.0;
     while (stop - time > 0.0) {
         int last = 0;
@@ -171,8 +272,16 @@ static fmi3Status march(Instance *m, double stop) {
         for (;;) {
             double error = attempt(m, time, h, &w);
             if (error >= 0.0 && error <= m->tolerance) {
-                time = last ? stop : time + h;
+                double taken = h;
+                if (N_RELAYS) {
+                    double part = farthest_part(m, time, h, &w);
+                    if (part < 1.0) attempt(m, time, taken = part * h, &w);
+                    if (beyond(m, w.now) > 0.0) taken = shorten(m, time, taken, &w);
+                }
+                last &= taken == h;
+                time = last ? stop : time + taken;
                 memcpy(w.begin, w.now, N_STATES * sizeof(double));
+                switch_relays(m, w.begin);
                 double grown = error > 0.0 ? 0.9 * h * pow(error / m->tolerance, -0.25) : 4.0 * h;
                 if (!last || grown < h) m->step = fmin(grown, 4.0 * h);
                 else m->step = fmax(m->step, fmin(grown, 4.0 * h));
@@ -237,7 +346,6 @@ fmi3Status fmi3EnterInitializationMode(fmi3Instance instance, fmi3Boolean has_to
 
 #define NOTHING_TO_DO(name) \
     fmi3Status name(fmi3Instance m) { return fmi3OK; }
-NOTHING_TO_DO(fmi3ExitInitializationMode)
 NOTHING_TO_DO(fmi3EnterEventMode)
 NOTHING_TO_DO(fmi3Terminate)
 NOTHING_TO_DO(fmi3EnterConfigurationMode)
@@ -245,6 +353,11 @@ NOTHING_TO_DO(fmi3ExitConfigurationMode)
 NOTHING_TO_DO(fmi3EvaluateDiscreteStates)
 NOTHING_TO_DO(fmi3EnterContinuousTimeMode)
 NOTHING_TO_DO(fmi3EnterStepMode)
+
+fmi3Status fmi3ExitInitializationMode(fmi3Instance instance) {
+    recall(instance);
+    return fmi3OK;
+}
 
 fmi3Status fmi3Reset(fmi3Instance m) {
     restart(m);
@@ -314,20 +427,28 @@ fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance m, size_t *n) {
 }
 
 fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance m, size_t *n) {
-    *n = 0;
+    *n = N_INDICATORS;
     return fmi3OK;
 }
 
-fmi3Status fmi3GetEventIndicators(fmi3Instance m, fmi3Float64 indicators[], size_t n) { return fmi3OK; }
+fmi3Status fmi3GetEventIndicators(fmi3Instance instance, fmi3Float64 indicators[], size_t n) {
+    Instance *m = instance;
+    if (n != N_INDICATORS) return fmi3Error;
+    refresh(m);
+    memcpy(indicators, m->value + INDICATORS, n * sizeof(double));
+    return fmi3OK;
+}
 
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance m, fmi3Boolean done, fmi3Boolean *event, fmi3Boolean *terminate) {
     *event = *terminate = fmi3False;
     return fmi3OK;
 }
 
-fmi3Status fmi3UpdateDiscreteStates(fmi3Instance m, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals,
+fmi3Status fmi3UpdateDiscreteStates(fmi3Instance instance, fmi3Boolean *again, fmi3Boolean *terminate, fmi3Boolean *nominals,
                                     fmi3Boolean *states, fmi3Boolean *has_next, fmi3Float64 *next) {
-    *again = *terminate = *nominals = *states = *has_next = fmi3False;
+    Instance *m = instance;
+    *again = *terminate = *nominals = *has_next = fmi3False;
+    *states = switch_relays(m, m->value + STATES) ? fmi3True : fmi3False;
     *next = 0.0;
     return fmi3OK;
 }
