@@ -268,7 +268,11 @@ def withdraw(state: Search, needed: float) -> None:
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
             asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
         without = {places: _attempted_without(state, places) for places in asked}
-        told = {places: (mean_excess(kept[0]) - left) / asked[places] for places, kept in without.items() if kept}
+        told = {
+            places: (mean_excess(kept[0]) - left) / asked[places] if asked[places] > 0.0 else np.inf
+            for places, kept in without.items()
+            if kept
+        }
         weakest = min(told, key=lambda places: told[places], default=None)
         if weakest is None or told[weakest] >= 1.0:
             return

@@ -234,6 +234,16 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
+def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As an ablation sets them."""
+    monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
+    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    state = Search(stub(load("n0"), left=1.0), stub(left=1.0), findings=[Finding(judged("n0", 50.0))])
+    withdraw(state, NEEDED)
+    assert state.findings
+
+
 @pytest.mark.parametrize(
     ("own", "reason", "kept"),
     [
