@@ -13,18 +13,19 @@ from replay.cli.main import main
 from tests.twin_core.interchange.test_decks import ESATAN
 from tests.twin_core.network.test_declared_terms import data
 from twin_core.calibrate.result import CalibratedModel
+from twin_core.effects import REGISTRY, Effect
 from twin_core.interchange.esatan import read_esatan
 from twin_core.network.calibrated import with_values
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 
 
-def model_of(spec_data: dict, **changed: float) -> CalibratedModel:  # type: ignore[type-arg]
+def model_of(spec_data: dict, *effects: Effect, **changed: float) -> CalibratedModel:  # type: ignore[type-arg]
     """Return a model at the declared values but some."""
     spec = load_spec(spec_data)
-    parameters = build_network(spec).parameters.updated(changed)
+    parameters = build_network(spec, effects).parameters.updated(changed)
     zero = dict.fromkeys(spec.sensors, 0.1)
-    return CalibratedModel(spec, (), parameters.as_dict(), np.zeros((0, 0)), (), zero, zero, zero, 60.0)
+    return CalibratedModel(spec, effects, parameters.as_dict(), np.zeros((0, 0)), (), zero, zero, zero, 60.0)
 
 
 def test_a_patch_puts_calibrated_couplings_into_the_deck(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,8 +81,11 @@ def test_a_unit_and_plain_data(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert {"name": "C:a", "unit": "J/K", "value": 800.0, "std": None, "held": False} in told["parameters"]
     heaters = [{"node": "a", "thermostat": {"on_K": 280.0, "off_K": 282.0, "power_W": {"value": 5.0}}}]
     (tmp_path / "model.json").write_text(json.dumps(model_of(radiator | {"heaters": heaters}).to_json()))
+    assert main(["export", str(tmp_path / "model.json"), "--fmu", "--out", str(unit)]) == 0
+    drift = REGISTRY["sensor_drift"]({"sensor": "T"}, {"d_K_per_s": 1e-6}, {"t0_s": 0.0, "dated": False})
+    (tmp_path / "model.json").write_text(json.dumps(model_of(radiator, drift).to_json()))
     assert main(["export", str(tmp_path / "model.json"), "--fmu", "--out", str(unit)]) == 2
-    assert "thermostat" in capsys.readouterr().err
+    assert "fault of a sensor" in capsys.readouterr().err
 
 
 def test_one_of_both(tmp_path: Path) -> None:

@@ -65,7 +65,7 @@ def test_both_databases_have_the_same_columns(tmp_path: Path, postgres: str) -> 
     Database(path).close()
     with contextlib.closing(sqlite3.connect(path)) as file:
         ours = {
-            (table, name, kinds[kind], bool(required or key))
+            (table, name.lower(), kinds[kind], bool(required or key))  # as PostgreSQL folds what is not quoted
             for (table,) in file.execute(
                 "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
             )
