@@ -20,15 +20,20 @@ def test_what_comes_while_a_batch_is_under_way_goes_together() -> None:
 
     async def ask(questions: list[int]) -> Sequence[int | Exception]:
         asked.append(questions)
-        await asyncio.sleep(0.01)
+        under_way.set()
+        await all_asked.wait()
         return [ModelError("no") if q == 4 else 10 * q for q in questions]
+
+    under_way, all_asked = asyncio.Event(), asyncio.Event()
 
     async def talk() -> list[Any]:
         batches = Batches(ask, at_once=1, most=5)
         tasks = [asyncio.create_task(batches.ask(q)) for q in range(9)]
-        await asyncio.sleep(0.005)
+        await under_way.wait()
         tasks[8].cancel()  # nobody waits for it any more
         late = [asyncio.create_task(batches.ask(q)) for q in (9,)]
+        await asyncio.sleep(0.0)  # it asks
+        all_asked.set()
         return await asyncio.gather(*tasks, *late, return_exceptions=True)
 
     found = asyncio.run(talk())
