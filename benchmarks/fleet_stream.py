@@ -86,6 +86,7 @@ async def stream(
     async with httpx.AsyncClient(timeout=30.0, trust_env=False, limits=limits) as client:
 
         async def send(twin: int, number: int) -> None:
+            """Send one sample of a spacecraft when it is due, again elsewhere where it was not acknowledged."""
             due_s = begin_s + (number + twin / count) * every_s
             await asyncio.sleep(max(due_s - time.time(), 0.0))
             told.late_s.append(time.time() - due_s)
@@ -117,6 +118,7 @@ async def stream(
                 await send(twin, number)
 
         async def ask() -> None:
+            """Ask for the forecast of a spacecraft at random every so often, and how far behind its newest sample it is."""
             rng = np.random.default_rng(1)
             while True:
                 await asyncio.sleep(forecast_every_s)

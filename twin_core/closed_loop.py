@@ -111,76 +111,42 @@ def close_loop(
         raise TelemetryError(f"deadline_s: must be a positive number of seconds (got {deadline_s:g})")
     begun = time.perf_counter()
     deadline = NO_DEADLINE if deadline_s is None else time.monotonic() + deadline_s
+    # The search ends at the deadline; what only illustrates its findings has a little longer.
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
-        return _close_loop(
-            spec,
-            records,
-            holdout,
-            holdout_records,
-            burn_in_s,
-            false_alarm_rate,
-            deadline,
-            latest,
-            begun,
-            moments,
-            first,
-            progress,
+        records = [screened(spec, record) for record in records]
+        holdout_records = [screened(spec, record) for record in holdout_records or ()]
+        train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
+        check_moments(train, moments)
+        fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
+        before = to_model(calibration, ())
+        whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+        base, every = searched(whole)
+        found = search(
+            base,
+            false_alarm_rate=false_alarm_rate,
+            deadline=deadline,
+            first={effect.place for effect in first},
+            progress=lambda f, m: progress(0.35 + 0.5 * f, m),
         )
-
-
-def _close_loop(
-    spec: TwinSpec,
-    records: Sequence[Record],
-    holdout: float | None,
-    holdout_records: Sequence[Record] | None,
-    burn_in_s: float | None,
-    false_alarm_rate: float,
-    deadline: float,
-    latest: float,
-    begun: float,
-    moments: Sequence[Moment],
-    first: Collection[Effect],
-    progress: Progress,
-) -> ClosedLoop:
-    """Close the loop on checked arguments.
-
-    The search ends at ``deadline``, and the witness, which decides nothing, at ``latest``, on the clock of
-    ``time.monotonic``; ``begun`` is on that of ``time.perf_counter``.
-    """
-    records = [screened(spec, record) for record in records]
-    holdout_records = [screened(spec, record) for record in holdout_records or ()]
-    train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
-    check_moments(train, moments)
-    fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
-    before = to_model(calibration, ())
-    whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
-    base, every = searched(whole)
-    found = search(
-        base,
-        false_alarm_rate=false_alarm_rate,
-        deadline=deadline,
-        first={effect.place for effect in first},
-        progress=lambda f, m: progress(0.35 + 0.5 * f, m),
-    )
-    found.every = every
-    after = _corrected_or(before, whole, found) if found.findings else before
-    progress(0.88, "predicting the hold-out")
-    predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
-    report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
-    progress(0.93, "drawing")
-    witness = bear_witness(found, deadline=latest)
-    report |= told_by(witness, report)
-    report |= told_mistakes(found, report, deadline=latest)
-    driven, lost = driven_heat(found, deadline=latest)
-    report["notices"] += lost
-    plots = build_plots(found, before, after, held, predictions, report, witness, driven)
-    report["quality"] = quality_json([*records, *holdout_records])
-    plots["quality_strip"] = quality_strip([*records, *holdout_records])
-    report["provenance"] = provenance(spec, [*records, *holdout_records])
-    report["elapsed_s"] = time.perf_counter() - begun
-    progress(1.0, "done")
-    return ClosedLoop(report, after, before, plots)
+        found.every = every
+        after = _corrected_or(before, whole, found) if found.findings else before
+        progress(0.88, "predicting the hold-out")
+        predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
+        report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
+        progress(0.93, "drawing")
+        witness = bear_witness(found, deadline=latest)
+        report |= told_by(witness, report)
+        report |= told_mistakes(found, report, deadline=latest)
+        driven, lost = driven_heat(found, deadline=latest)
+        report["notices"] += lost
+        plots = build_plots(found, before, after, held, predictions, report, witness, driven)
+        report["quality"] = quality_json([*records, *holdout_records])
+        plots["quality_strip"] = quality_strip([*records, *holdout_records])
+        report["provenance"] = provenance(spec, [*records, *holdout_records])
+        report["elapsed_s"] = time.perf_counter() - begun
+        progress(1.0, "done")
+        return ClosedLoop(report, after, before, plots)
 
 
 def _corrected_or(before: CalibratedModel, whole: Trial, found: Search) -> CalibratedModel:

@@ -13,7 +13,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
-from twin_core.discover.told import least_score, score_needed
+from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
 from twin_core.simulate.rollout import hurried
@@ -25,13 +25,13 @@ N_VALIDATED, N_VALIDATED_FREE = 3, 8
 
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
-SIZE_NOT_TOLD = "the record does not tell its size: other parameters of the model make up for it"
+SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters of the model make up for it"
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
-NEARLY_A_LAW = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
+SMALL_REMAINDER = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
 
 
 @dataclass(frozen=True)
@@ -185,8 +185,8 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
     """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
-    if least_score(simple, judged.trial) < score_needed(needed):
-        return replace(judged, reason=SIZE_NOT_TOLD), False
+    if least_wald_score(simple, judged.trial) < score_needed(needed):
+        return replace(judged, reason=SIZE_NOT_DETERMINED), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
@@ -211,7 +211,7 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     if not left:
         return ""
     little = policy.REPEATABLE_SHARE * (mean_excess(simple) - mean_excess(judged.trial))
-    return NEARLY_A_LAW if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW
+    return SMALL_REMAINDER if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

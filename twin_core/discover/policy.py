@@ -73,7 +73,7 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "MOST_COARSENESS": Threshold(
         NOISE_VARIANCE,
-        "what stays beyond it is no coarseness, and is not held against a name",
+        "what stays beyond it is no coarseness, and is not held against a name; a repeatable heat that leaves more is not little",
         "a misfit of two noises",
         1e12,
         2.0,
@@ -112,8 +112,9 @@ THRESHOLDS: dict[str, Threshold] = {
         1.0,
     ),
     "REPEATABLE_SHARE": Threshold(
-        "share of evidence",
-        "a name leaves no heat that repeats with temperature and is worth more than so much of its own evidence",
+        "share of evidence, and of the variance that a name removes",
+        "a name leaves no heat that repeats with temperature and is worth more than so much of its own evidence; up to as large a"
+        " share of the misfit that the name removes it is little",
         "a tenth: a law with a parameter of its own that is off by a third of its value leaves about as much",
         1e12,
         0.2,

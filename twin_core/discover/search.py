@@ -16,9 +16,9 @@ from twin_core.discover import policy
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
-    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_MORE,
+    SMALL_REMAINDER,
     Finding,
     Judged,
     Search,
@@ -94,16 +94,16 @@ def search(
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
         withdraw(state, needed)
-        _name_what_is_nearly_a_law(state, needed)
+        _name_what_leaves_little(state, needed)
     return state
 
 
-def _name_what_is_nearly_a_law(state: Search, needed: float) -> None:
+def _name_what_leaves_little(state: Search, needed: float) -> None:
     """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
 
     If it stands, and is likelier than the heat without a name that was found instead.
     """
-    near = [j for j in state.rejected if j.reason == NEARLY_A_LAW and len(j.trial.effects) == len(j.effects)]
+    near = [j for j in state.rejected if j.reason == SMALL_REMAINDER and len(j.trial.effects) == len(j.effects)]
     if not near:
         return
     best = min(near, key=worth)
@@ -282,8 +282,8 @@ def withdraw(state: Search, needed: float) -> None:
                 state.rejected.append(replace(finding.judged, effects=effects, reason=NO_MORE))
         kept = without[weakest]
         assert kept is not None
-        torn = [f for f in state.findings if any(e.place in weakest for e in f.effects)]
-        rests = [{e.place for e in f.effects} - weakest for f in torn]
+        shrunk = [f for f in state.findings if any(e.place in weakest for e in f.effects)]
+        rests = [{e.place for e in f.effects} - weakest for f in shrunk]
         _drop(state, weakest, *kept)
         for rest in filter(None, rests):
             _examine_again(state, rest, needed)
@@ -297,7 +297,7 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
         return
     option = replace(finding.judged, trial=state.trial)
     examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
-    if examined is not None and examined[0].reason not in ("", NEARLY_A_LAW):
+    if examined is not None and examined[0].reason not in ("", SMALL_REMAINDER):
         state.rejected.append(examined[0])
         _drop(state, places, *without)
 

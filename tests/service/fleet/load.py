@@ -116,7 +116,7 @@ class Load:
                 if answer.status_code not in (503, 507):
                     self.wrong.append(f"{name}: {answer.status_code} {answer.text}")
             except httpx.TransportError:
-                pass
+                pass  # the process was killed: counted below, and sent again to another
             self.refused += 1
             turn += 1
             if self._stop.is_set():

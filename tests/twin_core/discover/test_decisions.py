@@ -15,12 +15,12 @@ from twin_core.discover import search as searching
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
     LESS_LIKELY,
-    NEARLY_A_LAW,
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
-    SIZE_NOT_TOLD,
+    SIZE_NOT_DETERMINED,
+    SMALL_REMAINDER,
     Finding,
     Judged,
     Search,
@@ -42,8 +42,8 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import _name_what_is_nearly_a_law, least_explained, withdraw
-from twin_core.discover.told import score_needed
+from twin_core.discover.search import _name_what_leaves_little, least_explained, withdraw
+from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
@@ -248,11 +248,11 @@ def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyP
     ("own", "reason", "kept"),
     [
         ((DOMINANCE * LEAST - JUST, 90.0), "", ["n1"]),
-        ((DOMINANCE * LEAST - JUST, 90.0), NEARLY_A_LAW, ["n1"]),
+        ((DOMINANCE * LEAST - JUST, 90.0), SMALL_REMAINDER, ["n1"]),
         ((DOMINANCE * LEAST - JUST, 90.0), NO_FORESIGHT, []),
         ((DOMINANCE * LEAST, DOMINANCE * LEAST), NO_FORESIGHT, ["n0", "n1"]),
     ],
-    ids=["one too little", "the other is nearly a law", "the other is nothing by itself", "both enough"],
+    ids=["one too little", "the other leaves little", "the other is nothing by itself", "both enough"],
 )
 def test_of_effects_found_together_each_must_explain_something(
     monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], reason: str, kept: list[str]
@@ -299,7 +299,7 @@ SCORE = score_needed(NEEDED)
 
 @pytest.mark.parametrize(
     ("change", "score", "reason"),
-    [(0.0, SCORE, ""), (-JUST, SCORE, LESS_LIKELY), (0.0, SCORE - JUST, SIZE_NOT_TOLD)],
+    [(0.0, SCORE, ""), (-JUST, SCORE, LESS_LIKELY), (0.0, SCORE - JUST, SIZE_NOT_DETERMINED)],
     ids=["both are enough", "less likely along its trajectories", "of no size"],
 )
 def test_a_correction_is_told_by_its_own_trajectories(
@@ -313,7 +313,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
         Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
     )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
-    monkeypatch.setattr(judge, "least_score", lambda *trials: score)
+    monkeypatch.setattr(judge, "least_wald_score", lambda *trials: score)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
     assert judge.examine(simple, option, NEEDED)[0].reason == reason
 
@@ -330,11 +330,11 @@ SMALL = REPEATABLE_SHARE * (10.0 - 1.0)
     ("beside", "instead", "left", "reason"),
     [
         (None, None, 1.0, ""),
-        (SMALL, None, 1.0, NEARLY_A_LAW),
-        (None, SMALL, 1.0, NEARLY_A_LAW),
+        (SMALL, None, 1.0, SMALL_REMAINDER),
+        (None, SMALL, 1.0, SMALL_REMAINDER),
         (SMALL + JUST, None, 1.0, NO_LAW),
         (0.1, SMALL + JUST, 1.0, NO_LAW),
-        (MOST_COARSENESS, None, 9000.0, NEARLY_A_LAW),
+        (MOST_COARSENESS, None, 9000.0, SMALL_REMAINDER),
         (MOST_COARSENESS + JUST, None, 9000.0, NO_LAW),
     ],
     ids=["a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"],
@@ -362,13 +362,13 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
 
 
 @pytest.mark.parametrize(("found", "names"), [(None, ["a"]), (90.0 - JUST, ["a"]), (90.0, ["f"])])
-def test_what_is_nearly_a_law_is_named_where_nothing_likelier_is_found(found: float | None, names: list[str]) -> None:
+def test_what_leaves_little_is_named_where_nothing_likelier_is_found(found: float | None, names: list[str]) -> None:
     state = Search(stub(), stub())
     if found is not None:
         state.findings = [Finding(judged("f", found))]
-    likely, less = (replace(judged(node, nats), reason=NEARLY_A_LAW) for node, nats in (("a", 90.0), ("b", 60.0)))
+    likely, less = (replace(judged(node, nats), reason=SMALL_REMAINDER) for node, nats in (("a", 90.0), ("b", 60.0)))
     state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
-    _name_what_is_nearly_a_law(state, NEEDED)
+    _name_what_leaves_little(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == names
     named = names == ["a"]
     assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
@@ -378,8 +378,8 @@ def test_what_is_nearly_a_law_is_named_where_nothing_likelier_is_found(found: fl
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
     state = Search(stub(), stub())
     option = judged("a", 90.0)
-    state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=NEARLY_A_LAW)]
-    _name_what_is_nearly_a_law(state, NEEDED)
+    state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=SMALL_REMAINDER)]
+    _name_what_leaves_little(state, NEEDED)
     assert not state.findings
 
 

@@ -1,4 +1,4 @@
-"""Whether a record tells how much effects do: confounded ones fit well at many sizes, and predict well at none."""
+"""Wald test of effects: whether a record determines their size. Confounded ones fit well at many sizes."""
 
 import numpy as np
 from scipy.stats import norm
@@ -11,7 +11,7 @@ from twin_core.calibrate.second_order import Calibration
 from twin_core.discover.confirm import Trial, extended, reduced, shared_unknowns
 
 
-def least_score(simple: Trial, rich: Trial) -> float:
+def least_wald_score(simple: Trial, rich: Trial) -> float:
     """Return by how many of its standard deviations what an effect does to the readings differs from nothing: the least told.
 
     What it does is the difference of two open-loop trajectories, with it and without, all else alike. How certain that is
@@ -44,21 +44,37 @@ def least_score(simple: Trial, rich: Trial) -> float:
     known = {effect.place for effect in simple.effects}
     others = [[e for e in rich.effects if e is not own] for own in rich.effects if own.place not in known]
     problems = [extended(simple.fit.problem, rest) if rest else simple.fit.problem for rest in others]
-    return min((_score(calibration, covariance, problem) for problem in problems), default=np.inf)
+    slopes = stacked_jacobian(
+        calibration.problem,
+        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
+    )
+    return min((_score(calibration, slopes, covariance, problem) for problem in problems), default=np.inf)
 
 
-def _score(rich: Calibration, covariance: FloatArray, without: Problem) -> float:
-    """Return the score of what a problem lacks of a calibration with some covariance of its unknowns."""
+def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, without: Problem) -> float:
+    """Return the score of what a problem lacks of a calibration.
+
+    Parameters
+    ----------
+    rich
+        The calibration.
+    slopes : (n_samples, n_sensors, n_unknowns)
+        Derivatives of its predicted readings, in K.
+    covariance : (n_unknowns, n_unknowns)
+        Of its unknowns.
+    without
+        The problem that lacks something, of the same telemetry.
+    """
     problem, optimum = rich.problem, rich.optimum
     unknowns = reduced(rich, without)
     fit = without.solve(unknowns)
     if not np.isfinite(fit.cost):
         return np.inf
     done_K = np.concatenate(optimum.fit.predicted_K) - np.concatenate(fit.predicted_K)
-    slopes = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
-    slopes[:, :, shared_unknowns(rich, without)] -= stacked_jacobian(without, without.jacobian_blocks(unknowns, fit))
+    change = slopes.copy()
+    change[:, :, shared_unknowns(rich, without)] -= stacked_jacobian(without, without.jacobian_blocks(unknowns, fit))
     valid = np.isfinite(np.concatenate(rich.residuals))
-    variance_K2 = np.einsum("tsi,tsi->ts", slopes @ covariance, slopes)
+    variance_K2 = np.einsum("tsi,tsi->ts", change @ covariance, change)
     squares, variances = (np.where(valid, a / problem.noise_K**2, 0.0).sum() for a in (done_K**2, variance_K2))
     return float(np.sqrt(squares / variances)) if squares > 0.0 else 0.0
 

@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 from twin_core._typing import FloatArray
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Trial, try_effects
-from twin_core.discover.told import least_score, score_needed
+from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 from twin_core.network.spec_io import load_spec
@@ -76,7 +76,7 @@ def test_the_score_is_that_of_many_draws_of_the_noise() -> None:
         theta, _ = curve_fit(lambda t, *x: block_K(np.array(x)), TIME_S, record, p0=truth)
         done.append(block_K(theta) - block_K(theta * [1.0, 1.0, 0.0, 1.0]))
     oracle = np.sqrt((np.mean(done, axis=0) ** 2).sum() / np.var(done, axis=0).sum())
-    assert least_score(simple, rich) == pytest.approx(oracle, rel=0.2)
+    assert least_wald_score(simple, rich) == pytest.approx(oracle, rel=0.2)
 
 
 @pytest.mark.parametrize(("period_s", "is_told"), [(3000.0, False), (1900.0, True)], ids=["same period", "another one"])
@@ -88,4 +88,4 @@ def test_a_load_with_the_period_of_a_declared_input_has_no_size(period_s: float,
     )
     simple, rich = trials(effect, hidden, 3000.0)
     assert rich.fit.log_posterior > simple.fit.log_posterior + 50.0
-    assert (least_score(simple, rich) > score_needed(np.log(100.0))) == is_told
+    assert (least_wald_score(simple, rich) > score_needed(np.log(100.0))) == is_told
