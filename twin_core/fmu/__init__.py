@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import uuid
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -134,21 +135,7 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
     plan = _plan(model)
     network, spec, names = plan.network, model.spec, plan.names
     parameters, relays = plan.parameters, plan.relays
-    n, unit_of = len(network.nodes), {name: channel.unit for name, channel in spec.channels.items()}
-    header = [
-        f'#define TOKEN "{_token(model)}"',
-        f"enum {{ N_STATES = {n}, N_INPUTS = {len(plan.inputs)}, N_OUTPUTS = {len(spec.sensors)},"
-        f" N_PARAMETERS = {len(parameters)}, N_BOUNDARIES = {len(spec.boundaries)}, N_CHANNELS = {len(names.inputs)},"
-        f" N_RELAYS = {len(relays)} }};",
-        f"#define UNSETTLED {UNSETTLED!r}",
-        "/* Of a thermostat: states of its node and its memory, thresholds among the parameters, what the memory is. */",
-        "typedef struct { int node, memory, on, off; double on_K, off_K; } Relay;",
-        "extern const Relay network_relays[];",
-        "extern const double network_start[], network_inputs[], network_parameters[];",
-        "void network_rates(double time, const double *T, const double *inputs, const double *p, const double *share,"
-        " double *rates);",
-        "void network_outputs(double time, const double *T, const double *p, double *outputs);",
-    ]
+    n, unit_of = len(network.nodes), _units(model)
     clock = "time" if plan.epoch_s is None else f"time + p[{names.parameters[EPOCH]}]"
     body = [f"    double clock = {clock}, sun = sun_factor(clock), q = 0.0;", "    (void)sun, (void)q;"]
     body += ["    double B[N_BOUNDARIES + 1], Q[N_STATES] = {0}, u[N_CHANNELS + 1];"]
@@ -158,14 +145,7 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
         for name, d in spec.derived.items()
         if _reachable(d.formula, names)
     ]
-    for i, (name, boundary) in enumerate(spec.boundaries.items()):
-        if boundary.channel is not None:
-            shift = f" + {ZERO_CELSIUS_K}" if unit_of[boundary.channel] == "degC" else ""
-            body.append(f"    B[{i}] = {names.u(boundary.channel)}{shift};")
-        elif boundary.value_K is not None:
-            body.append(f"    B[{i}] = {boundary.value_K!r};")
-        else:
-            body.append(f"    B[{i}] = p[{names.parameters[f'T:{name}']}];")
+    body += [f"    {line}" for line in _boundaries(model, names)]
     body += [f"    {line}" for line in boundary_changes(network, names)]
     body += [f"    {line}" for line in heats(network, model.effects, names)]
     index = network.capacity_index
@@ -197,7 +177,51 @@ def c_source(model: CalibratedModel) -> dict[str, str]:
         *outputs,
         "}",
     ]
-    return {"network.h": "\n".join(header) + "\n", "network.c": "\n".join(text) + "\n"}
+    return {"network.h": _header(plan), "network.c": "\n".join(text) + "\n"}
+
+
+def _header(plan: _Plan) -> str:
+    """Return the text of the header: how many there are of what, and what the solver calls."""
+    spec = plan.model.spec
+    counts = {
+        "N_STATES": len(plan.network.nodes),
+        "N_INPUTS": len(plan.inputs),
+        "N_OUTPUTS": len(spec.sensors),
+        "N_PARAMETERS": len(plan.parameters),
+        "N_BOUNDARIES": len(spec.boundaries),
+        "N_CHANNELS": len(plan.names.inputs),
+        "N_RELAYS": len(plan.relays),
+    }
+    lines = [
+        f'#define TOKEN "{_token(plan.model)}"',
+        f"enum {{ {', '.join(f'{name} = {count}' for name, count in counts.items())} }};",
+        f"#define UNSETTLED {UNSETTLED!r}",
+        "/* Of a thermostat: states of its node and its memory, thresholds among the parameters, what the memory is. */",
+        "typedef struct { int node, memory, on, off; double on_K, off_K; } Relay;",
+        "extern const Relay network_relays[];",
+        "extern const double network_start[], network_inputs[], network_parameters[];",
+        "void network_rates(double time, const double *T, const double *inputs, const double *p, const double *share,"
+        " double *rates);",
+        "void network_outputs(double time, const double *T, const double *p, double *outputs);",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _units(model: CalibratedModel) -> dict[str, str | None]:
+    return {name: channel.unit for name, channel in model.spec.channels.items()}
+
+
+def _boundaries(model: CalibratedModel, names: Names) -> Iterator[str]:
+    """Yield what sets the boundaries' temperatures in K: a channel, a known value, or a parameter."""
+    units = _units(model)
+    for i, (name, boundary) in enumerate(model.spec.boundaries.items()):
+        if boundary.channel is not None:
+            shift = f" + {ZERO_CELSIUS_K}" if units[boundary.channel] == "degC" else ""
+            yield f"B[{i}] = {names.u(boundary.channel)}{shift};"
+        elif boundary.value_K is not None:
+            yield f"B[{i}] = {boundary.value_K!r};"
+        else:
+            yield f"B[{i}] = p[{names.parameters[f'T:{name}']}];"
 
 
 def _relay(relay: ThermostatHeat, names: Names) -> str:
