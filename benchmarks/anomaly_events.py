@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.markdown import markdown_table, save_table
-from twin_core.anomaly import Thresholds, detect
+from twin_core.anomaly import Thresholds
+from twin_core.anomaly.detect import detect
 from twin_core.assimilate import assimilate
 from twin_core.calibrate import CalibratedModel, calibrate
 from twin_core.fem.demo import ORBIT_S, demo_scenario

@@ -9,7 +9,7 @@ from service.store import anomalies, events, jobs, models
 from service.store.connection import Connection
 from service.stream.messages import EventStretch, Stretch
 from service.workbench.interface import Outcome
-from twin_core.anomaly.detect import TOGETHER
+from twin_core.anomaly.hysteresis import TOGETHER
 
 Json = dict[str, Any]
 

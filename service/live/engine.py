@@ -22,6 +22,7 @@ from service.workbench.interface import (
     Stretch,
     Telemetry,
 )
+from service.workbench.watching import watched
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -47,10 +48,9 @@ class Engine:
         self._pool: ProcessPoolExecutor | None = None
         self._filters = Batches(self._assimilate, WORKERS, TOGETHER)
 
-    async def assimilate(self, document: str, telemetry: Telemetry, state: Json | None) -> Filtered:
-        """Filter a stretch of telemetry; short ones that wait at the same time go together."""
-        stretch = Stretch(document, telemetry, state)
-        if telemetry.time_us.size <= SHORT:
+    async def assimilate(self, stretch: Stretch) -> Filtered:
+        """Filter a stretch of telemetry and look for anomalies in it; short ones that wait at the same time go together."""
+        if stretch.telemetry.time_us.size <= SHORT:
             return await self._filters.ask(stretch)
         (found,) = await self._assimilate([stretch])
         if isinstance(found, Exception):
@@ -115,7 +115,11 @@ def _start(workers: int) -> ProcessPoolExecutor:
 
 
 def _assimilate(workbench: MakeWorkbench, stretches: Sequence[Stretch]) -> Sequence[Filtered | Exception]:
-    return workbench().assimilate(stretches)
+    found = workbench().assimilate(stretches)
+    return [
+        watched(stretch, one) if isinstance(one, Filtered) else one
+        for stretch, one in zip(stretches, found, strict=True)
+    ]
 
 
 def _memory_s(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> float:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from service.live import screening
 from service.live.engine import Engine
-from service.live.position import RECENT, Position, stretch
+from service.live.position import RECENT, Json, Position, stretch
 from service.live.progress import Step
 from service.store import samples
 from service.store.anomalies import Change
@@ -15,8 +15,8 @@ from service.store.database import Database
 from service.store.models import Active
 from service.store.samples import Samples
 from service.twins.registry import Entry
-from service.workbench.interface import Filtered, Telemetry
-from twin_core.anomaly import Thresholds, detect
+from service.workbench.interface import Filtered, Stretch, Telemetry, Watch
+from twin_core.anomaly import Thresholds
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,13 @@ class Following:
         self._engine, self._thresholds = engine, thresholds
 
     async def filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
-        """Filter a block from a position; TwinError or Refusal if it cannot be done."""
+        """Filter a block from a position and look for anomalies in it; TwinError or Refusal if it cannot be done."""
         clean, seen = await self._readings(fresh, before)
         telemetry, held = stretch(self._twin, clean, active.epoch_us, before)
         state = None if before is None else before.state
-        return Followed(seen, await self._engine.assimilate(active.document, telemetry, state), held)
+        readings = {sensor: seen.values[self._twin.channels.index(sensor)] for sensor in self._twin.sensors}
+        watch = Watch(readings, _detector(active, before, fresh), self._thresholds)
+        return Followed(seen, await self._engine.assimilate(Stretch(active.document, telemetry, state, watch)), held)
 
     async def memory_s(self, active: Active, telemetry: Telemetry) -> float:
         """Return the longest time constant of a model where some telemetry begins."""
@@ -93,7 +95,7 @@ class Following:
         *,
         is_provisional: bool = False,
     ) -> tuple[Position, Step]:
-        """Look for anomalies in a filtered block; return where that leaves the filter, and what is to be written down.
+        """Return where a filtered block leaves the filter, and what is to be written down.
 
         Parameters
         ----------
@@ -115,17 +117,21 @@ class Following:
         time_us, filtered = done.seen.time_us, done.filtered
         new = slice(-time_us.size, None)
         innovation, std, nis = filtered.innovation_K[new], filtered.innovation_std_K[new], filtered.nis[new]
-        after_gap = before is not None and bool(time_us[0] - before.time_us > active.longest_gap_us)
-        detector = None if before is None or after_gap else before.detector
-        values = done.seen.values[[self._twin.channels.index(s) for s in filtered.sensors]].T
-        detector, intervals = detect(
-            detector, filtered.sensors, time_us, values, innovation, std, nis, self._thresholds
-        )
-        changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in intervals]
+        changes = [Change(i.sensor, i.kind, i.start, i.stop, i.score) for i in filtered.intervals]
         count = (0 if before is None else before.n_samples) + int(time_us.size)
         recent_us = [*([] if before is None else before.recent_us), *time_us[-RECENT:].tolist()][-RECENT:]
-        after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, detector, recent_us)
+        after = Position(int(time_us[-1]), seq, count, filtered.state, done.held, filtered.watch or {}, recent_us)
         checkpoint = None if is_provisional else after.checkpoint()
         found = (time_us, *self._in_order(filtered.sensors, innovation, std), nis, told, changes)
-        step = Step(active.version, revision, after_us, after_gap, *found, checkpoint)
+        step = Step(active.version, revision, after_us, _is_after_gap(active, before, done.seen), *found, checkpoint)
         return after, step
+
+
+def _is_after_gap(active: Active, before: Position | None, fresh: Samples) -> bool:
+    """Return whether a block begins a long gap after the position before it."""
+    return before is not None and bool(fresh.time_us[0] - before.time_us > active.longest_gap_us)
+
+
+def _detector(active: Active, before: Position | None, fresh: Samples) -> Json | None:
+    """Return what the search for anomalies goes on from; None where it begins, as it does behind a long gap."""
+    return None if before is None or _is_after_gap(active, before, fresh) else before.detector

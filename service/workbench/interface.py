@@ -8,6 +8,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from twin_core.anomaly import Interval, Thresholds
+
 Progress = Callable[[float, str], None]
 Json = dict[str, Any]
 Inputs = Literal["auto", "repeat", "hold"]
@@ -53,12 +55,32 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
+class Watch:
+    """What the search for anomalies needs of a stretch besides its residuals.
+
+    Attributes
+    ----------
+    readings : sensor -> (n_new,)
+        The newest samples as they were read, those included that the filter is not given; NaN where missing.
+    state
+        What the search before this stretch left behind; None to begin.
+    thresholds
+        Where an anomaly opens.
+    """
+
+    readings: Mapping[str, NDArray[np.float64]]
+    state: Json | None
+    thresholds: Thresholds
+
+
+@dataclass(frozen=True)
 class Stretch:
     """Telemetry to be filtered with the model of a document, from a state whose instant is that of its first sample."""
 
     document: str
     telemetry: Telemetry
     state: Json | None
+    watch: Watch | None = None
 
 
 @dataclass(frozen=True)
@@ -103,13 +125,18 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Filtered:
-    """An assimilated stretch: (n_times, n_sensors) innovations and their predicted standard deviations, (n_times,) NIS."""
+    """An assimilated stretch: (n_times, n_sensors) innovations and their predicted standard deviations, (n_times,) NIS.
+
+    Where anomalies were looked for, ``watch`` is what the next search goes on from, ``intervals`` what changed.
+    """
 
     sensors: tuple[str, ...]
     innovation_K: NDArray[np.float64]
     innovation_std_K: NDArray[np.float64]
     nis: NDArray[np.float64]
     state: Json
+    watch: Json | None = None
+    intervals: tuple[Interval, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def test_the_process_dies_over_one_twin_and_the_others_have_their_answers() -> N
     async def talk() -> list[Any]:
         engine = Engine(FakeWorkbench)
         readings = [291.0, 292.0, DEADLY, UNFIT, 293.0]
-        questions = [engine.assimilate(*vars(stretch(reading)).values()) for reading in readings]
+        questions = [engine.assimilate(stretch(reading)) for reading in readings]
         found = await asyncio.gather(*questions, return_exceptions=True)
         await engine.close()
         return found

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin_core.anomaly import Interval, Thresholds, detect
-from twin_core.anomaly.detect import TOGETHER
-from twin_core.anomaly.hysteresis import HOLD
+from twin_core.anomaly import Interval, Thresholds
+from twin_core.anomaly.detect import detect
+from twin_core.anomaly.hysteresis import HOLD, TOGETHER
 from twin_core.anomaly.innovations import (
     CUSUM_WINDOW,
     NIS_WINDOW,

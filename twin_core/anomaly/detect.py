@@ -1,16 +1,14 @@
 """The detector: every statistic of every sensor, and of all of them together, carried over stretches of samples."""
 
 from collections.abc import Sequence
+from math import isfinite
 
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, Json
 from twin_core.anomaly import innovations, readings
-from twin_core.anomaly.hysteresis import Interval, follow
+from twin_core.anomaly.hysteresis import TOGETHER, Interval, follow
 from twin_core.anomaly.thresholds import Thresholds
-
-TOGETHER = "*"
-"""What stands for the sensor of a joint anomaly; no channel can have this name."""
 
 
 def detect(
@@ -53,11 +51,12 @@ def detect(
     after: Json = {"sensors": {}}
     intervals: list[Interval] = []
     explained = np.zeros(time.size, dtype=np.bool_)
-    for column, sensor in enumerate(sensors):
+    columns = (np.ascontiguousarray(matrix.T) for matrix in (innovation_K / std_K, reading, std_K))
+    for sensor, scaled, read, std in zip(sensors, *columns, strict=True):
         one = _Sensor(sensor, known.get(sensor, {}), limits)
-        one.residual(time, innovation_K[:, column] / std_K[:, column])
-        one.repeats(time, reading[:, column], std_K[:, column])
-        one.missing(time, reading[:, column])
+        one.residual(time, scaled)
+        one.repeats(time, read, std)
+        one.missing(time, read)
         explained |= one.busy
         after["sensors"][sensor] = one.state
         intervals += one.intervals
@@ -89,36 +88,19 @@ class _Sensor:
 
     def repeats(self, time: np.ndarray, reading: FloatArray, std_K: FloatArray) -> None:
         """Look for readings that repeat exactly: a run of them is a stuck sensor, more than usual a coarser one."""
-        std_K = self._lasting(std_K)  # a masked reading has no innovation, yet a stuck sensor is known by it
-        valid = np.isfinite(reading) & np.isfinite(std_K)
-        values, last = reading[valid], self._before.get("last")
-        steps = np.abs(np.diff(values, prepend=np.nan if last is None else last))
-        finest = np.fmin.accumulate(
-            np.concatenate([[self._before.get("step", np.inf)], np.where(steps > 0, steps, np.inf)])
-        )
-        resolution = np.where(np.isfinite(finest[:-1]), finest[:-1], 0.0)
-        least_p = resolution / (2.0 * np.sqrt(np.pi) * std_K[valid])
-        hits = ~(steps > 0.0)  # the very first reading has none before it and is no news either
+        before = (self._before.get("last", np.nan), self._before.get("std", np.nan), self._before.get("step", np.inf))
+        carried = np.array(before, dtype=np.float64)
+        valid, hits, least_p = readings.repeats(carried, reading, std_K)
+        self.state |= {
+            name: value
+            for name, value in zip(("last", "std", "step"), carried.tolist(), strict=True)
+            if isfinite(value)
+        }
         self.state["stuck"], score, run = readings.run_scores(self._before.get("stuck", {}), hits, least_p)
         self._follow("stuck", time[valid], score, score)
         short = hits & (run < readings.LEAST_RUN)
         self.state["coarse"], score = readings.excess_scores(self._before.get("coarse", {}), short, least_p)
         self._follow("quantised", time[valid], score, score)
-        if values.size:
-            last = float(values[-1])
-        if last is not None:
-            self.state["last"] = last
-        if np.isfinite(finest[-1]):
-            self.state["step"] = float(finest[-1])
-
-    def _lasting(self, std_K: FloatArray) -> FloatArray:
-        """Return the standard deviations, where one is missing that of the sample before, (n_times,)."""
-        known = np.concatenate([[self._before.get("std", np.nan)], std_K])
-        place = np.maximum.accumulate(np.where(np.isfinite(known), np.arange(known.size), 0))
-        filled: FloatArray = known[place]
-        if np.isfinite(filled[-1]):
-            self.state["std"] = float(filled[-1])
-        return filled[1:]
 
     def missing(self, time: np.ndarray, reading: FloatArray) -> None:
         """Look for a sensor that stays away; one that never came is not missed."""

@@ -7,6 +7,8 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.anomaly.thresholds import CLOSE
 
+TOGETHER = "*"
+"""What stands for the sensor of a joint anomaly; no channel can have this name."""
 HOLD = 20
 """Samples below ``CLOSE`` that end an interval."""
 
@@ -58,6 +60,8 @@ def follow(
     state, intervals
         The state as plain data, and every interval that was opened, raised or closed.
     """
+    if not state and not (score > opening).any():
+        return {}, []
     current = Interval(sensor, kind, state["start"], None, state["score"]) if "start" in state else None
     loud, quiet = state.get("loud", 0), state.get("quiet", 0)
     changed: list[Interval] = []

@@ -15,7 +15,10 @@ T. L. Lai, Sequential changepoint detection in quality control and dynamical sys
 Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation (2001), section 5.4.
 """
 
+import math
+
 import numpy as np
+from numba import njit
 
 from twin_core._typing import FloatArray
 from twin_core.anomaly.thresholds import ALLOWANCE, Thresholds
@@ -44,51 +47,64 @@ def scores(past: FloatArray, scaled: FloatArray, thresholds: Thresholds) -> tupl
         Bring the CUSUM to the scale of the others.
     """
     series = np.concatenate([past, scaled])
-    cut = np.clip(series, -SPIKE, SPIKE)
-    nis = nis_score(np.clip(series, -BOUND, BOUND) ** 2, np.ones(series.size))
-    slope = slope_score(cut)
-    count = np.minimum(np.arange(1, series.size + 1), TREND_WINDOW)
-    mean = np.abs(windowed(cut, TREND_WINDOW)) / np.sqrt(count)
-    bias = cusum(cut) * (thresholds.open / thresholds.cusum)
-    score, lasting = np.maximum.reduce([nis, bias, slope]), np.maximum.reduce([nis, mean, slope])
-    return score[past.size :], lasting[past.size :]
+    return _scores(series, past.size, thresholds.open / thresholds.cusum)
 
 
-def nis_score(squares: FloatArray, freedom: FloatArray) -> FloatArray:
-    """Return the score of the sum of ``squares`` over a window in which chi-square has the sum of ``freedom``."""
-    total, count = windowed(squares, NIS_WINDOW), windowed(freedom, NIS_WINDOW)
-    spread = 2.0 / (9.0 * np.maximum(count, 1.0))
-    return np.where(count > 0, (np.cbrt(total / np.maximum(count, 1.0)) - (1.0 - spread)) / np.sqrt(spread), 0.0)
+@njit(cache=True)
+def _scores(series: FloatArray, first: int, cusum_scale: float) -> tuple[FloatArray, FloatArray]:
+    cut = np.minimum(np.maximum(series, -SPIKE), SPIKE)
+    bounded = np.minimum(np.maximum(series, -BOUND), BOUND)
+    nis = nis_score(bounded**2, np.ones(series.size), first)
+    slope, bias = slope_score(cut, first), cusum(cut, first)
+    score, lasting = np.empty(nis.size), np.empty(nis.size)
+    for k in range(nis.size):
+        begin = max(first + k + 1 - TREND_WINDOW, 0)
+        window = cut[begin : first + k + 1]
+        mean = abs(window.sum()) / math.sqrt(window.size)
+        score[k] = max(nis[k], bias[k] * cusum_scale, slope[k])
+        lasting[k] = max(nis[k], mean, slope[k])
+    return score, lasting
 
 
-def cusum(series: FloatArray) -> FloatArray:
-    """Return the greater of both one-sided CUSUMs over the last ``CUSUM_WINDOW`` samples, (n_times,)."""
-    total, steps = np.concatenate([[0.0], np.cumsum(series)]), np.arange(series.size + 1)
-    sides = [_rise(sign * total - ALLOWANCE * steps) for sign in (1.0, -1.0)]
-    return np.maximum(*sides)
+@njit(cache=True)
+def nis_score(squares: FloatArray, freedom: FloatArray, first: int = 0) -> FloatArray:
+    """Return the score of the sum of ``squares`` over a window in which chi-square has the sum of ``freedom``.
+
+    Of the samples from ``first`` on, (n_times - first,), as the other scores of a series do.
+    """
+    out = np.zeros(squares.size - first)
+    for k in range(out.size):
+        begin, stop = max(first + k + 1 - NIS_WINDOW, 0), first + k + 1
+        count = freedom[begin:stop].sum()
+        if count > 0.0:
+            spread = 2.0 / (9.0 * max(count, 1.0))
+            out[k] = (np.cbrt(squares[begin:stop].sum() / max(count, 1.0)) - (1.0 - spread)) / math.sqrt(spread)
+    return out
 
 
-def _rise(path: FloatArray) -> FloatArray:
-    """Return how far a path has risen above its least value in the window, (n_times,)."""
-    padded = np.concatenate([np.full(CUSUM_WINDOW, np.inf), path])
-    least = np.lib.stride_tricks.sliding_window_view(padded, CUSUM_WINDOW + 1).min(axis=1)
-    rise: FloatArray = (path - least)[1:]
-    return rise
+@njit(cache=True)
+def cusum(series: FloatArray, first: int = 0) -> FloatArray:
+    """Return the greater of both one-sided CUSUMs over the last ``CUSUM_WINDOW`` samples, (n_times - first,)."""
+    out = np.zeros(series.size - first)
+    for k in range(out.size):
+        up = down = 0.0
+        for i in range(first + k, max(first + k - CUSUM_WINDOW, -1), -1):
+            up += series[i] - ALLOWANCE
+            down -= series[i] + ALLOWANCE
+            out[k] = max(out[k], up, down)
+    return out
 
 
-def slope_score(series: FloatArray) -> FloatArray:
+@njit(cache=True)
+def slope_score(series: FloatArray, first: int = 0) -> FloatArray:
     """Return the least-squares slope over ``TREND_WINDOW`` samples in its own standard deviations, unsigned."""
-    place = np.arange(series.size, dtype=np.float64)
-    count = np.minimum(place + 1.0, TREND_WINDOW)
-    centre = place - (count - 1.0) / 2.0
-    moment = windowed(place * series, TREND_WINDOW) - centre * windowed(series, TREND_WINDOW)
-    spread = np.sqrt(count * (count**2 - 1.0) / 12.0)
-    return np.where(count > 2.0, np.abs(moment) / np.maximum(spread, 1.0), 0.0)
-
-
-def windowed(series: FloatArray, window: int) -> FloatArray:
-    """Return the sum over each sample and the ``window - 1`` before it."""
-    total = np.concatenate([[0.0], np.cumsum(series)])
-    stop = np.arange(1, series.size + 1)
-    summed: FloatArray = total[stop] - total[np.maximum(stop - window, 0)]
-    return summed
+    out = np.zeros(series.size - first)
+    for k in range(out.size):
+        begin, stop = max(first + k + 1 - TREND_WINDOW, 0), first + k + 1
+        count = float(stop - begin)
+        if count > 2.0:
+            moment, centre = 0.0, (count - 1.0) / 2.0
+            for i in range(begin, stop):
+                moment += (i - begin - centre) * series[i]
+            out[k] = abs(moment) / math.sqrt(count * (count**2 - 1.0) / 12.0)
+    return out

@@ -8,7 +8,10 @@ A run of r hits, or x of n in a window, is scored by the signed root of its devi
 close to standard normal (P. McCullagh, J. A. Nelder, Generalized Linear Models, 2nd ed. 1989, section 2.4).
 """
 
+import math
+
 import numpy as np
+from numba import njit
 
 from twin_core._typing import BoolArray, FloatArray, Json
 
@@ -18,6 +21,38 @@ WINDOW = 60
 LEAST_P, MOST_P = 2e-3, 0.999
 PRIOR = 8.0
 """Hits assumed before anything was seen: until it shows otherwise, a sensor may well repeat itself or stay away."""
+
+
+@njit(cache=True)
+def repeats(carried: FloatArray, reading: FloatArray, std_K: FloatArray) -> tuple[BoolArray, BoolArray, FloatArray]:
+    """Return which samples can repeat the reading before, and of those which do and how probable that is at least.
+
+    A reading that was masked has no standard deviation of its own, yet a stuck sensor is known by it: the one before holds.
+
+    Parameters
+    ----------
+    carried : (3,)
+        The last reading, the last standard deviation and the finest step so far (NaN, NaN, inf to begin), carried in place.
+    reading, std_K : (n_times,)
+        NaN where missing.
+    """
+    last, std, finest = carried
+    valid = np.zeros(reading.size, dtype=np.bool_)
+    hits, least_p = np.zeros(reading.size, dtype=np.bool_), np.zeros(reading.size)
+    n = 0
+    for k in range(reading.size):
+        std = std_K[k] if math.isfinite(std_K[k]) else std
+        if math.isfinite(reading[k]) and math.isfinite(std):
+            step = abs(reading[k] - last)
+            valid[k] = True
+            hits[n] = not step > 0.0  # the very first reading has none before it and is no news either
+            least_p[n] = (finest if math.isfinite(finest) else 0.0) / (2.0 * math.sqrt(math.pi) * std)
+            if step > 0.0:
+                finest = min(finest, step)
+            last = reading[k]
+            n += 1
+    carried[:] = last, std, finest
+    return valid, hits[:n].copy(), least_p[:n].copy()
 
 
 def run_scores(state: Json, hits: BoolArray, least_p: FloatArray | float) -> tuple[Json, FloatArray, FloatArray]:
@@ -32,43 +67,63 @@ def run_scores(state: Json, hits: BoolArray, least_p: FloatArray | float) -> tup
     least_p : (n_times,) or number
         Least probability of a hit of a healthy sensor.
     """
-    n = hits.size
-    place = np.arange(n)
-    last_miss = np.maximum.accumulate(np.where(hits, -1, place)) if n else place
-    run = np.where(last_miss >= 0, place - last_miss, place + 1 + state.get("run", 0))
-    seen, hit = state.get("seen", 0) + place + 1, state.get("hit", 0) + np.cumsum(hits)
-    probability = _bounded((PRIOR + hit - run) / (PRIOR + seen - run), least_p)
-    score = np.where(run >= LEAST_RUN, np.sqrt(-2.0 * run * np.log(probability)), 0.0)
-    after = {"seen": int(seen[-1]), "hit": int(hit[-1]), "run": int(run[-1])} if n else state
-    return after, score, run
+    counts = np.array([state.get(name, 0) for name in ("seen", "hit", "run")])
+    score, run = _run_scores(counts, hits, least_p + np.zeros(hits.size))
+    return dict(zip(("seen", "hit", "run"), counts.tolist(), strict=True)) if hits.size else state, score, run
+
+
+@njit(cache=True)
+def _run_scores(counts: np.ndarray, hits: BoolArray, least_p: FloatArray) -> tuple[FloatArray, np.ndarray]:
+    """Return scores and lengths of runs; samples seen, hits and the present run in ``counts`` are carried in place."""
+    score, runs = np.zeros(hits.size), np.zeros(hits.size, dtype=np.int64)
+    seen, hit, run = counts
+    for k in range(hits.size):
+        seen += 1
+        hit += hits[k]
+        run = run + 1 if hits[k] else 0
+        runs[k] = run
+        if run >= LEAST_RUN:
+            probability = _bounded((PRIOR + hit - run) / (PRIOR + seen - run), least_p[k])
+            score[k] = math.sqrt(-2.0 * run * math.log(probability))
+    counts[:] = seen, hit, run
+    return score, runs
 
 
 def excess_scores(state: Json, hits: BoolArray, least_p: FloatArray | float) -> tuple[Json, FloatArray]:
     """Return the state and the score of how many hits a window holds beyond what came before it, (n_times,)."""
     past = np.array(state.get("past", []), dtype=np.bool_)
     series = np.concatenate([past, hits])
-    total = np.concatenate([[0], np.cumsum(series)])
-    stop = np.arange(past.size, series.size) + 1
-    start = np.maximum(stop - WINDOW, 0)
-    seen, hit = state.get("seen", 0) + start, state.get("hit", 0) + total[start]
-    probability = _bounded((PRIOR + hit) / (PRIOR + seen), least_p)
-    size = stop - start
-    share = (total[stop] - total[start]) / np.maximum(size, 1)
-    score = np.where(share > probability, np.sqrt(2.0 * size * _divergence(share, probability)), 0.0)
+    seen, hit = state.get("seen", 0), state.get("hit", 0)
+    score = _excess_scores(series, past.size, seen, hit, least_p + np.zeros(hits.size))
     kept = max(series.size - WINDOW, 0)
-    forgotten = {"seen": state.get("seen", 0) + kept, "hit": state.get("hit", 0) + int(total[kept])}
+    forgotten = {"seen": seen + kept, "hit": hit + int(series[:kept].sum())}
     return forgotten | {"past": series[kept:].astype(int).tolist()}, score
 
 
-def _bounded(probability: FloatArray, least_p: FloatArray | float) -> FloatArray:
-    bounded: FloatArray = np.clip(np.maximum(probability, least_p), LEAST_P, MOST_P)
-    return bounded
+@njit(cache=True)
+def _excess_scores(series: BoolArray, first: int, seen: int, hit: int, least_p: FloatArray) -> FloatArray:
+    """Return the score of each sample from ``first`` on; ``seen`` samples with ``hit`` hits came before the series."""
+    score = np.zeros(series.size - first)
+    earlier = hit + series[: max(first - WINDOW, 0)].sum()
+    for k in range(score.size):
+        begin, stop = max(first + k + 1 - WINDOW, 0), first + k + 1
+        if begin > max(first - WINDOW, 0):
+            earlier += series[begin - 1]
+        probability = _bounded((PRIOR + earlier) / (PRIOR + seen + begin), least_p[k])
+        share = series[begin:stop].sum() / (stop - begin)
+        if share > probability:
+            score[k] = math.sqrt(2.0 * (stop - begin) * _divergence(share, probability))
+    return score
 
 
-def _divergence(share: FloatArray, probability: FloatArray) -> FloatArray:
-    """Return the Kullback-Leibler divergence of two Bernoulli distributions."""
+@njit(cache=True)
+def _bounded(probability: float, least_p: float) -> float:
+    return min(max(probability, least_p, LEAST_P), MOST_P)
+
+
+@njit(cache=True)
+def _divergence(share: float, probability: float) -> float:
+    """Return the Kullback-Leibler divergence of two Bernoulli distributions, of a share above zero."""
     rest = 1.0 - share
-    with np.errstate(divide="ignore", invalid="ignore"):
-        hit = np.where(share > 0.0, share * np.log(share / probability), 0.0)
-        miss = np.where(rest > 0.0, rest * np.log(rest / (1.0 - probability)), 0.0)
-    return np.maximum(hit + miss, 0.0)
+    miss = rest * math.log(rest / (1.0 - probability)) if rest > 0.0 else 0.0
+    return max(share * math.log(share / probability) + miss, 0.0)
