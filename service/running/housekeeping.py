@@ -14,6 +14,8 @@ from service.store.database import Database
 log = logging.getLogger("service")
 
 EVERY_S = 600.0
+SUCCESSION_S = 1.0
+"""A process that does not lead asks so often whether it does now: at its start it has no lease yet."""
 PAUSE_S = 0.01
 CHORES: tuple[tuple[str, Callable[[Connection], int]], ...] = (
     ("deleted samples that can no longer be restored", aside.expire),
@@ -44,14 +46,15 @@ class Housekeeping:
     async def _run(self) -> None:
         while True:
             self._wake.clear()
-            for what, chore in (*CHORES, *self._database.engine.chores) if self._ownership.leads else ():
+            leads = self._ownership.leads
+            for what, chore in (*CHORES, *self._database.engine.chores) if leads else ():
                 try:
                     await self._finish(what, chore)
                 except Exception as error:  # the next time may be a better one
                     reason = error.detail if isinstance(error, Refusal) else f"{type(error).__name__}: {error}"
                     log.warning("housekeeping was interrupted", extra={"chore": what, "reason": reason})
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(EVERY_S):
+                async with asyncio.timeout(EVERY_S if leads else SUCCESSION_S):
                     await self._wake.wait()
 
     async def _finish(self, what: str, chore: Callable[[Connection], int]) -> None:
