@@ -18,17 +18,20 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
 
 LEAST_SPREAD = 2e-3
-"""No two spacecraft are more alike than this, in ln."""
+"""Standard deviation in ln, 0.2 %: less than what parts are made to. It keeps the population's precision finite."""
 ITERATIONS, TOLERANCE = 1000, 1e-6
+"""Of expectation maximisation, which stops where mean and spread move by less, in ln: far below the least spread."""
 PASSES = 4
-"""So often the population is learned anew without those that differ from it."""
+"""So often at most the population is learned anew without those that differ from it; it ends where the same ones differ again."""
 OUTLYING = 4.0
-"""In robust standard deviations: who lies further away has no say in the first of these passes."""
+"""In robust standard deviations: who lies further away has no say in the first of these passes. Of fifty healthy siblings with
+five parameters one is left out in two families of a hundred (6e-5 two-sided, Gaussian), and comes back in the second pass."""
 WIDE = 1e6
-"""Prior deviation that stands for none."""
+"""Prior standard deviation that stands for none, in ln: its information, 1e-12, is below the 1e-9 that any record keeps."""
 RATE = 0.01
-"""False discovery rate at which a sibling differs from its family."""
+"""False discovery rate at which a sibling differs from its family: of a hundred named, one is wrong on average."""
 Z = 1.959963984540054
+"""97.5 % quantile of the normal distribution: intervals are of 95 %."""
 
 
 @dataclass(frozen=True)
