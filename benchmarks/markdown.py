@@ -1,7 +1,9 @@
 """Tables of measurements: markdown, with the date, the commit and the command that printed them."""
 
 import platform
+import shlex
 import subprocess
+import sys
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -29,7 +31,8 @@ def commit() -> str:
 def save_table(name: str, title: str, table: str, module: str, note: str = "") -> Path:
     """Save a table under ``benchmarks/tables`` with where it comes from; return its path."""
     today = datetime.now(UTC).strftime("%Y-%m-%d")
-    source = f"`python -m {module}`, {today}, commit {commit()}, Python {platform.python_version()}, two cores."
+    command = shlex.join(["python", "-m", module, *sys.argv[1:]])
+    source = f"`{command}`, {today}, commit {commit()}, Python {platform.python_version()}, two cores."
     path = TABLES / f"{name}.md"
     TABLES.mkdir(exist_ok=True)
     path.write_text("\n\n".join(part for part in (f"# {title}", source, table.strip(), note) if part) + "\n")

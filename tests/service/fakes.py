@@ -26,6 +26,8 @@ from twin_core.errors import ModelError
 SENSORS = ("T_px", "T_tank")
 UNFIT = 666.0
 """A reading that the fake filter cannot assimilate."""
+GATED, GATE = 18.0, "FAKE_GATE"
+"""A calibration with such a power ends once there is a file of the name that the environment tells."""
 DEADLY = 667.0
 """A reading over which the process of the fake filter dies."""
 
@@ -34,7 +36,7 @@ class FakeWorkbench:
     """Calibrates to a given error, crashes or dawdles when a channel says so.
 
     The mean of ``Q_px`` chooses what a calibration does: 13 dies, 14 raises, 15 refuses, 16 runs for ever, 17 cannot be
-    scored, anything else is the RMSE in K that the new model claims on recent data.
+    scored, 18 waits for a gate, anything else is the RMSE in K that the new model claims on recent data.
     """
 
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
@@ -46,7 +48,7 @@ class FakeWorkbench:
             raise ZeroDivisionError("unexpected")
         if wish == 15:
             raise ModelError("the balance has no solution")
-        while wish == 16:
+        while wish == 16 or (wish == GATED and not Path(os.environ[GATE]).exists()):
             progress(0.5, "at it")
             time.sleep(0.02)
         train = task.telemetry.before(task.validation_us)

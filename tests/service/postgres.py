@@ -77,6 +77,13 @@ class Postgres:
         self.run("initdb", "-D", str(self.data), *options)
         return self
 
+    def trust(self, network: str) -> None:
+        """Let those of another network in."""
+        with (self.data / "pg_hba.conf").open("a") as file:
+            file.write(f"host all all {network} trust\n")
+        if self.process is not None:
+            self.process.send_signal(signal.SIGHUP)
+
     def start(self) -> Self:
         """Start it and wait until it answers."""
         settings = (f"port={self.port}", "listen_addresses=127.0.0.1", f"unix_socket_directories={self.folder}")

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Self
 
@@ -21,8 +22,12 @@ FAKE = (
 class Server:
     """Starts ``python -m service`` and ends it; the log lies beside the database."""
 
-    def __init__(self, folder: Path, command: str | None = None, **settings: str) -> None:
-        """Keep the database in ``folder``; settings are ``TWIN_*`` variables without the prefix."""
+    def __init__(self, folder: Path, command: str | None = None, within: Sequence[str] = (), **settings: str) -> None:
+        """Keep the database in ``folder``; settings are ``TWIN_*`` variables without the prefix.
+
+        ``within`` is a command that runs another one: in a network of its own, say.
+        """
+        self._within = within
         self._folder = folder
         self._arguments = ["-m", "service"] if command is None else ["-c", command]
         own = {"port": "0", "database_url": f"sqlite:///{folder / 'twin.sqlite3'}", **settings}
@@ -35,7 +40,7 @@ class Server:
         """Start the process and wait until it answers."""
         with (self._folder / "server.log").open("ab") as log:
             self.process = subprocess.Popen(
-                [sys.executable, *self._arguments],
+                [*self._within, sys.executable, *self._arguments],
                 env=self._environment,
                 stdout=subprocess.PIPE,
                 stderr=log,

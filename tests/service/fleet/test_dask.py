@@ -7,11 +7,15 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
+import psycopg
 import pytest
 
 from service.jobs.dask import DaskTasks
 from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed
+from tests.service.fakes import GATE
+from tests.service.fleet.load import assert_jobs_done_once, calibrations, fleet, prepare
 from twin_core.errors import ModelError
 
 pytestmark = [pytest.mark.fleet, pytest.mark.filterwarnings("ignore")]
@@ -40,10 +44,15 @@ class Cluster:
         """Start both."""
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        self.address = f"tcp://127.0.0.1:{port}"
-        self.scheduler = self._start("dask_scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+            self._port = free.getsockname()[1]
+        self.address = f"tcp://127.0.0.1:{self._port}"
+        self.scheduler = self.add_scheduler()
         self.worker = self.add_worker()
+
+    def add_scheduler(self) -> "subprocess.Popen[bytes]":
+        """Start a scheduler at the address of the cluster."""
+        options = ("--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard")
+        return self._start("dask_scheduler", *options)
 
     def add_worker(self) -> "subprocess.Popen[bytes]":
         """Start another worker."""
@@ -100,3 +109,38 @@ def test_a_task_survives_its_worker_and_is_given_back_with_its_scheduler(cluster
     with pytest.raises(ExecutorLost):
         lost.result(90)
     tasks.shutdown()
+
+
+def test_jobs_of_a_service_survive_worker_and_scheduler(
+    tmp_path: Path, postgres: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The worker dies under a task, then the scheduler; jobs wait in the database and are done by what comes back."""
+    gate = tmp_path / "gate"
+    monkeypatch.setenv(GATE, str(gate))
+    prepare(postgres, 1)
+    cluster = Cluster()
+    try:
+        with fleet(tmp_path, [postgres], executor=cluster.address.replace("tcp://", "dask://")) as (service,):
+            jobs = calibrations(service, 3)
+
+            def wait_for(condition: str) -> None:
+                end_s = time.monotonic() + 90.0
+                with psycopg.connect(postgres, autocommit=True) as connection:
+                    while not connection.execute(f"SELECT 1 FROM job WHERE {condition}").fetchone():
+                        assert time.monotonic() < end_s, condition
+                        time.sleep(0.1)
+
+            wait_for("state = 'running' AND progress > 0.4")  # it computes
+            cluster.kill(cluster.worker)
+            cluster.worker = cluster.add_worker()
+            time.sleep(3)
+            cluster.kill(cluster.scheduler)
+            wait_for("state = 'queued' AND message = 'waiting for a free worker' AND started_us IS NOT NULL")
+            cluster.kill(cluster.worker)  # it would come back to the next scheduler by itself
+            cluster.scheduler = cluster.add_scheduler()
+            cluster.worker = cluster.add_worker()
+            gate.touch()
+            assert_jobs_done_once(postgres, jobs, "SIGKILL of a Dask worker, then of the Dask scheduler", 180.0)
+    finally:
+        cluster.kill(cluster.worker)
+        cluster.kill(cluster.scheduler)
