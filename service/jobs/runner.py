@@ -110,17 +110,18 @@ class Jobs:
             row = await self._database.read(jobs.get, twin.key, kind, job)
             if row.state == "cancelled":
                 self._metrics.jobs.labels(kind, row.state).inc()
-        running = self._running.get(job)
-        if running is not None and running.task is not None:
-            running.cancel.request()
-            await asyncio.wait([running.task])
-        elif row.state == "running":
+        if row.state == "running" and job not in self._running:
             await self._database.write(jobs.ask_to_cancel, job)
-            until_s = time.monotonic() + CANCEL_S
-            while row.state == "running" and time.monotonic() < until_s:
+        until_s = time.monotonic() + CANCEL_S
+        while row.state == "running" and time.monotonic() < until_s:
+            running = self._running.get(job)  # what this process claimed a moment ago stands there a turn later
+            if running is not None and running.task is not None:
+                running.cancel.request()
+                await asyncio.wait([running.task])
+            else:
                 await asyncio.sleep(0.1)
-                row = await self._database.read(jobs.get, twin.key, kind, job)
-        return await self._database.read(jobs.get, twin.key, kind, job)
+            row = await self._database.read(jobs.get, twin.key, kind, job)
+        return row
 
     async def cancel_twin(self, twin: Entry) -> None:
         """End every job of a twin that is about to go."""
@@ -192,7 +193,7 @@ class Jobs:
         try:
             twin = await self._find(held.twin)
             if twin is None:
-                return
+                raise JobCancelled
             if held.attempt > MOST_ATTEMPTS:
                 raise JobFailed(f"its worker died {MOST_ATTEMPTS} times; take fewer samples, or look at the log")
             await self._work(twin, held, cancel)

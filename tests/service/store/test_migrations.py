@@ -40,7 +40,7 @@ def old_file(tmp_path: Path) -> Path:
 
 
 def test_an_old_archive_is_read_written_deleted_and_compacted(old_file: Path, make_client: Any) -> None:
-    client = make_client()
+    client = make_client(database_url=f"sqlite:///{old_file}")
     detail = client.get(TWIN).json()
     assert (detail["samples"], detail["quarantined"], detail["telemetry"]["T_px"]["state"]) == (20, 0, "stale")
     made = client.request("DELETE", f"{TWIN}/telemetry", params={"start": 5, "stop": 8}).json()
