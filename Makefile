@@ -100,6 +100,7 @@ bench-fleet: $(STAMP)
 	$(BIN)/python -m benchmarks.fleet_filter
 	$(BIN)/python -m benchmarks.family
 	$(BIN)/python -m benchmarks.sqlite_before
+	$(BIN)/python -m benchmarks.fleet_page
 	$(BIN)/python -m benchmarks.fleet_faults
 	$(BIN)/python -m benchmarks.fleet_stream
 

@@ -21,7 +21,7 @@ def test_a_report_for_each(pair: dict[str, Any], pair_telemetry: Callable[[int],
         (folder / "spec.yaml").write_text(yaml.safe_dump(pair))
         text = pair_telemetry(240)
         (folder / "flight.csv").write_text("\n".join(text.splitlines()[:8]) + "\n" if name == "empty" else text)
-    assert main(["close-loop", "--fleet", str(fleet), "--out", str(out), "--deadline", "60"]) == 0
+    assert main(["close-loop", "--fleet", str(fleet), "--out", str(out), "--deadline", "200"]) == 0
     found = json.loads((out / "fleet.json").read_text())
     assert sorted(found) == ["alpha", "beta", "empty"] and "error" in found["empty"]
     for name in ("alpha", "beta"):
