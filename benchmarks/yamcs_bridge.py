@@ -147,7 +147,8 @@ def measure(n_nodes: int, n_times: int, n_live: int, *, busy: int = 0) -> tuple[
 
 
 def _told(delays: Sequence[float], expected: int) -> list[str]:
-    return [f"{len(delays)} of {expected}", *(f"{1000 * q:.0f}" for q in np.quantile(delays, [0.5, 0.95, 1.0]))]
+    found = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
+    return [f"{len(delays)} of {expected}", *(f"{1000 * q:.0f}" for q in found)]
 
 
 @contextmanager
