@@ -95,7 +95,7 @@ def import_model(
         raise click.UsageError("--over-time belongs to SINDA decks; other tools' arrays over time are always read")
     found = _read(kind, texts, columns, values, hidden, held, spread, over_time)
     refused = list(found.refused)
-    if not found.data["nodes"]:
+    if not found.data.get("nodes"):
         raise SpecError(_without_nodes(kind, files))
     if refused and not skip_unknown:
         raise SpecError(
