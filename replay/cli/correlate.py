@@ -103,6 +103,8 @@ def correlate(
     report = found.report
     report["sensitivity"] = sensitivity(found.calibration)
     report["provenance"] = provenance(spec, [phase.record for phase in phases])
+    for row, phase in zip(report["provenance"]["telemetry"], phases, strict=True):
+        row["steady"] = phase.steady
     report["document"] = document(author, [spec_file, *steady, *transient])
     drawn = limits(spec, found.model.noise_K)
     plots = {"criteria": spec.criteria.model_dump(), "phases": found.plots, "limits": drawn}

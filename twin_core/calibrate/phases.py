@@ -232,7 +232,8 @@ def _told_held(names: Sequence[str]) -> list[str]:
     if not names:
         return []
     shown = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
-    return [f"{len(names)} parameter(s) keep their guesses, for the sensors tell more of the others: {shown}"]
+    kept = "1 parameter keeps its guess" if len(names) == 1 else f"{len(names)} parameters keep their guesses"
+    return [f"{kept}, for the sensors tell more of the others: {shown}"]
 
 
 def _series(spec: TwinSpec, phase: Phase, measured_K: FloatArray, tables: Mapping[str, FloatArray]) -> Json:

@@ -61,4 +61,4 @@ def test_phases_at_rest_tell_of_conductances_alone() -> None:
         "G:a|b",
         "G:b|plate",
     }
-    assert found.report["notices"][0].startswith("4 parameter(s) keep their guesses")
+    assert found.report["notices"][0].startswith("4 parameters keep their guesses")
