@@ -383,7 +383,7 @@ def test_a_forecast_beyond_a_limit_is_an_alarm_of_yamcs(
 def test_limits_exceeded_and_forecast_are_events(
     yamcs: Yamcs, service: Server, client: TwinClient, config: YamcsConfig
 ) -> None:
-    """The workbench of these tests holds the last reading, 0.45 K on both sides; the red limit is 320 K."""
+    """The workbench of these tests expects that the last reading stays; the red limit is 320 K, and 320 K is not beyond it."""
     from replay.bridges.yamcs_gateway import Row, YamcsGateway
 
     def send(first: int, stop: int, reading_K: float) -> None:
@@ -394,11 +394,11 @@ def test_limits_exceeded_and_forecast_are_events(
         with YamcsGateway(yamcs.url, "sat") as gateway:
             gateway.publish("pp_realtime", rows)
 
-    send(0, 59, 319.9)
+    send(0, 59, 320.0)
     make_bridge(config, yamcs, service).run(once=True)
     client.wait("benchsat", client.calibrate("benchsat"))
     with running(make_bridge(config, yamcs, service)):
-        send(59, 60, 319.9)
+        send(59, 60, 320.0)
         until(lambda: "LIMIT_FORECAST" in {event.event_type for event in events(yamcs)}, "the forecast is told")
         assert "LIMIT" not in {event.event_type for event in events(yamcs)}
         send(60, 63, 321.0)
