@@ -2,10 +2,10 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -252,6 +252,48 @@ def test_what_is_dumped_late_fills_the_gap(
     assert_once_each(published(yamcs, "nis"), range(120))
 
 
+def test_what_is_live_does_not_wait_for_the_archive(
+    yamcs: Yamcs, service: Server, client: TwinClient, config: YamcsConfig
+) -> None:
+    from replay.bridges.yamcs_bridge import YamcsBridge
+    from replay.bridges.yamcs_gateway import Row, YamcsGateway
+
+    class SlowArchive(YamcsGateway):
+        """Reads its archive slowly; notes which residuals are published meanwhile."""
+
+        is_reading = False
+        meanwhile: ClassVar[set[int]] = set()
+
+        def history(self, *span: Any) -> Iterator[Row]:
+            self.is_reading = True
+            for row in super().history(*span):
+                time.sleep(0.05)
+                yield row
+            self.is_reading = False
+
+        def publish(self, stream: str, rows: Sequence[Row]) -> int:
+            if self.is_reading:
+                self.meanwhile.update(row.time_ms for row in rows if f"{TOP}/model_version" in row.values)
+            return super().publish(stream, rows)
+
+    often = config.model_copy(update={"backfill": config.backfill.model_copy(update={"every_s": 1.0})})
+    feed(yamcs, 0, 60)
+    make_bridge(often, yamcs, service).run(once=True)
+    client.wait("benchsat", client.calibrate("benchsat"))
+    slow = YamcsBridge(
+        often, lambda: SlowArchive(yamcs.url, "sat"), service.client(), service.url, lambda _: None, poll_s=0.1
+    )
+    with running(slow):
+        until(lambda: len(published(yamcs, "nis")) == 60, "the first residuals are there")
+        for k in range(60, 100):
+            feed(yamcs, k, k + 1)
+            time.sleep(0.2)
+        until(lambda: len(published(yamcs, "nis")) >= 100, "all residuals are there")
+        until(lambda: SlowArchive.meanwhile, "residuals are published while the archive is read")
+    assert_once_each(published(yamcs, "nis"), range(100))
+    assert client.twin("benchsat").samples == 100
+
+
 def test_wrong_credentials_are_told_and_right_ones_pass(
     make_yamcs: Callable[..., Yamcs],
     service: Server,
@@ -336,6 +378,37 @@ def test_a_forecast_beyond_a_limit_is_an_alarm_of_yamcs(
         alarms = reader.get_processor("sat", "realtime")
         until(lambda: list(alarms.list_alarms()), "there is an alarm")
         assert {(alarm.name, alarm.severity) for alarm in alarms.list_alarms()} == {(f"{TOP}/T_px/q95", "CRITICAL")}
+
+
+def test_limits_exceeded_and_forecast_are_events(
+    yamcs: Yamcs, service: Server, client: TwinClient, config: YamcsConfig
+) -> None:
+    """The workbench of these tests expects that the last reading stays; the red limit is 320 K, and 320 K is not beyond it."""
+    from replay.bridges.yamcs_gateway import Row, YamcsGateway
+
+    def send(first: int, stop: int, reading_K: float) -> None:
+        other = {"/SAT/thermal/T_tank": 15.0, "/SAT/eps/Q_px": 500.0}
+        rows = [
+            Row(T0_MS + k * STEP_MS, {"/SAT/thermal/T_px": reading_K - 273.15, **other}) for k in range(first, stop)
+        ]
+        with YamcsGateway(yamcs.url, "sat") as gateway:
+            gateway.publish("pp_realtime", rows)
+
+    send(0, 59, 320.0)
+    make_bridge(config, yamcs, service).run(once=True)
+    client.wait("benchsat", client.calibrate("benchsat"))
+    with running(make_bridge(config, yamcs, service)):
+        send(59, 60, 320.0)
+        until(lambda: "LIMIT_FORECAST" in {event.event_type for event in events(yamcs)}, "the forecast is told")
+        assert "LIMIT" not in {event.event_type for event in events(yamcs)}
+        send(60, 63, 321.0)
+        until(lambda: "LIMIT" in {event.event_type for event in events(yamcs)}, "the limit is told")
+        send(63, 66, 300.0)
+        until(lambda: {"LIMIT_ENDED", "LIMIT_FORECAST_ENDED"} <= {e.event_type for e in events(yamcs)}, "both end")
+    said = {event.event_type: event for event in events(yamcs)}
+    assert said["LIMIT_FORECAST"].severity == "DISTRESS" and said["LIMIT"].severity == "CRITICAL"
+    assert said["LIMIT"].generation_time.timestamp() * 1000 == T0_MS + 60 * STEP_MS
+    assert said["LIMIT_ENDED"].severity == "INFO"
 
 
 def test_the_service_may_be_away_at_first(yamcs: Yamcs, service: Server, config: YamcsConfig) -> None:
