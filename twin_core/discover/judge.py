@@ -156,8 +156,9 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
     weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
     refused: list[Judged] = []
-    for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
-        if best.evidence.log_bayes_factor <= needed:
+    most = N_VALIDATED_FREE if is_free else N_VALIDATED
+    for best in judged:
+        if best.evidence.log_bayes_factor <= needed or sum(j.validation is not None for j in refused) == most:
             continue
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
