@@ -11,6 +11,7 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
+from twin_core.discover.coarseness import stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.discover.wald import least_wald_score, score_needed
@@ -151,32 +152,39 @@ def threshold(false_alarm_rate: float) -> float:
 
 
 def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
-    """Keep the best option that passes evidence and validation; False if none does."""
+    """Keep the best option that passes evidence and validation; False if none does.
+
+    One that would be withdrawn, for it explains too little beside what stays, is kept only where no other one passes.
+    """
     judged = simplest_first(once_each(options))
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
     weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
-    refused: list[Judged] = []
     most = N_VALIDATED_FREE if is_free else N_VALIDATED
+    refused: list[Judged] = []
+    passed: list[Judged] = []
     for best in judged:
-        if best.evidence.log_bayes_factor <= needed or sum(j.validation is not None for j in refused) == most:
+        n_validated = sum(j.validation is not None for j in refused) + len(passed)
+        if best.evidence.log_bayes_factor <= needed or n_validated >= most:
             continue
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
-        refused.append(own)
-        if resembles:
-            break  # what explains less is no better a name for this heat
-        if own.validation is not None and not own.reason:
-            refused.pop()
-            elsewhere = [
-                j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
-            ]
-            close = tuple(j for j in elsewhere if is_close(j, best))
-            state.findings.append(Finding(own, close))
-            state.trial = best.trial
-            state.rejected += refused
-            return True
-    state.rejected += [*refused, *weak]
-    return False
+        if own.reason:
+            refused.append(own)
+            if resembles:
+                break  # what explains less is no better a name for this heat
+        else:
+            passed.append(own)
+            if stands(state.trial, own.trial):
+                break
+    state.rejected += refused
+    if not passed:
+        state.rejected += weak
+        return False
+    named = next((own for own in passed if stands(state.trial, own.trial)), passed[0])
+    others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused)]
+    state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
+    state.trial = named.trial
+    return True
 
 
 def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:

@@ -13,6 +13,7 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
+from twin_core.discover.coarseness import by_chance, least_explained, stands
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -130,7 +131,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if not widened or (told and mean_excess(by_heat.trial) <= policy.MOST_COARSENESS):
+    if not widened or (told and stands(state.trial, by_heat.trial)):
         state.join(by_heat)
         return bool(told)
     beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
@@ -300,28 +301,6 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
     if examined is not None and examined[0].reason not in ("", SMALL_REMAINDER):
         state.rejected.append(examined[0])
         _drop(state, places, *without)
-
-
-def by_chance(n_readings: int) -> float:
-    """Return the variance, in units of the sensors' noise, up to which what stays of so many readings is chance."""
-    return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
-
-
-def least_explained(beside: float, left: float, n_readings: int) -> float:
-    """Return the variance that names must explain, in units of the sensors' noise.
-
-    Parameters
-    ----------
-    beside
-        What counts as left beside them.
-    left
-        What stays unexplained. Where that is more than chance leaves of ``n_readings`` independent readings, whose variance has
-        a standard error of sqrt(2 / n), the network is seen to be coarse.
-    n_readings
-        How many there are.
-    """
-    shown = min(max(left / by_chance(n_readings) - 1.0, 0.0), 1.0)
-    return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
 
 
 def prune(state: Search, needed: float) -> None:
