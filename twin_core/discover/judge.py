@@ -154,7 +154,7 @@ def threshold(false_alarm_rate: float) -> float:
 def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     """Keep the best option that passes evidence and validation; False if none does.
 
-    One that would be withdrawn, for it explains too little beside what stays, is kept only where no other one passes.
+    A name that would be withdrawn, for it explains too little beside what stays, is kept only where no other one passes.
     """
     judged = simplest_first(once_each(options))
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
@@ -174,13 +174,13 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
                 break  # what explains less is no better a name for this heat
         else:
             passed.append(own)
-            if stands(state.trial, own.trial):
+            if is_free or stands(state.trial, own.trial):
                 break
     state.rejected += refused
     if not passed:
         state.rejected += weak
         return False
-    named = next((own for own in passed if stands(state.trial, own.trial)), passed[0])
+    named = passed[-1] if is_free or stands(state.trial, passed[-1].trial) else passed[0]
     others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused)]
     state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
     state.trial = named.trial
