@@ -102,7 +102,7 @@ def search(
 def _name_what_leaves_little(state: Search, needed: float) -> None:
     """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
 
-    If it stands, and is likelier than the heat without a name that was found instead.
+    If it stands, and predicts what it was not fitted to better than the heat without a name that was found instead.
     """
     near = [j for j in state.rejected if j.reason == SMALL_REMAINDER and len(j.trial.effects) == len(j.effects)]
     if not near:
@@ -111,12 +111,8 @@ def _name_what_leaves_little(state: Search, needed: float) -> None:
     rest = [j for j in state.rejected if j.effects != best.effects]
     named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
     withdraw(named, needed)
-    if named.findings and _worth_of_all(named) < _worth_of_all(state):
+    if named.findings and best.validation and all(best.validation.foresight < f.foresight for f in state.findings):
         state.join(named)
-
-
-def _worth_of_all(state: Search) -> float:
-    return sum(worth(finding.judged) for finding in state.findings)
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
