@@ -8,7 +8,7 @@ service, events by Yamcs, and of published rows those are left out whose generat
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -22,7 +22,10 @@ from service.client import TwinClient
 
 PAUSE_S, LONGEST_PAUSE_S = 0.5, 15.0
 """Between two attempts to connect: doubles from the first to the last."""
+SHARE = 0.1
+"""At most this share of the time goes into reading the archive again."""
 _NUMBER = re.compile(r"\d+(\.\d+)?")
+_END = object()
 
 
 @dataclass
@@ -107,20 +110,27 @@ class YamcsBridge:
 
     def _follow(self, inward: Inward, outward: Outward) -> None:
         """Keep both sides in step until asked to stop; Away when something breaks."""
-        rescan_s = 0.0
+        looking: Iterator[None] | None = outward.publish_again()  # the archive was read a moment ago
+        begun_s = due_s = time.monotonic()
         try:
             while not self._stop.is_set():
-                inward.drain(self._poll_s)
+                inward.drain(self._poll_s if looking is None else 0.0)
                 inward.check()
-                if time.monotonic() >= rescan_s:
-                    rescan_s = time.monotonic() + self._config.backfill.every_s
-                    inward.backfill(self._side.detail())
-                    outward.publish_again()
+                if looking is None and time.monotonic() >= due_s:
+                    begun_s, looking = time.monotonic(), self._look_again(inward, outward)
+                if looking is not None and next(looking, _END) is _END:
+                    took_s, looking = time.monotonic() - begun_s, None
+                    due_s = begun_s + max(self._config.backfill.every_s, took_s / SHARE)
                 outward.publish()
         except ServiceAway:
             with suppress(Away):  # where Yamcs is away as well, nobody can be told
                 outward.tell_away()
             raise
+
+    def _look_again(self, inward: Inward, outward: Outward) -> Iterator[None]:
+        """Pass on what either side got late, step by step: what is live does not wait for the past."""
+        yield from inward.backfill(self._side.detail())
+        yield from outward.publish_again()
 
     def _forget(self, *beginnings: str) -> None:
         """Tell of the next interruption again."""

@@ -2,7 +2,8 @@
 
 import queue
 import threading
-from collections.abc import Callable, Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,8 @@ from service.schemas import TwinDetail
 
 BATCH = 2000
 """Most rows sent to the service in one request."""
+SLICE_S = 0.2
+"""So long the archive is read before what is live has its turn."""
 HELD = 200_000
 """Rows of the subscription that may wait; beyond them the connection begins anew and fetches from the archive."""
 
@@ -49,7 +52,8 @@ class Inward:
         names = [source.name for source in self._config.parameters.values()]
         self._wiring = self._wire(twin, names, first)
         self._subscription = self._gateway.subscribe(list(self._wiring.feeds), self._hear)
-        self.backfill(twin)
+        for _ in self.backfill(twin):
+            pass  # what is live waits: a twin is given its past in order
 
     def end(self) -> None:
         """Hear nothing any more."""
@@ -86,8 +90,8 @@ class Inward:
                 rows.append(self._inbox.get_nowait())
         self._ingest(rows)
 
-    def backfill(self, twin: TwinDetail) -> None:
-        """Fetch from Yamcs' archive what the twin may lack: all of it at first, then the recent past."""
+    def backfill(self, twin: TwinDetail) -> Iterator[None]:
+        """Fetch from Yamcs' archive what the twin may lack, in slices of time: all of it at first, then the recent past."""
         start = self._config.backfill.start
         first_ms = parse_utc_ms(start) if start else None
         if twin.last_time is not None:
@@ -96,11 +100,15 @@ class Inward:
         if first_ms is None:
             return
         rows: list[Row] = []
+        pause_s = time.monotonic() + SLICE_S
         for row in self._gateway.history(list(self._wiring.feeds), first_ms):
             rows.append(row)
             if len(rows) == BATCH:
                 self._ingest(rows)
                 rows = []
+            if time.monotonic() >= pause_s:
+                yield
+                pause_s = time.monotonic() + SLICE_S
         self._ingest(rows)
 
     def _ingest(self, rows: Sequence[Row]) -> None:

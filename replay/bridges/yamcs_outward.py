@@ -1,7 +1,7 @@
 """The other direction of the bridge: forecasts, residuals, health and events of a twin into Yamcs."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from functools import partial
@@ -55,6 +55,12 @@ class Watermarks:
     forecast_ms: int = -1
     events: set[str] = field(default_factory=set)
 
+    def forget_before(self, time_ms: int) -> None:
+        """Move the beginning of what is remembered on."""
+        if time_ms > self.since_ms:
+            self.since_ms = time_ms
+            self.residuals = {t for t in self.residuals if t >= time_ms}
+
 
 class Outward:
     """Publishes a twin through one connection to Yamcs."""
@@ -71,6 +77,7 @@ class Outward:
         """Publish nothing yet; ``reports`` is where the addresses of reports begin."""
         self._config, self._gateway, self._side, self._tally, self._tell = config, gateway, side, tally, tell
         self._reports, self._name = reports, partial(name_of, config)
+        self._look_ms = round(1000 * config.backfill.look_back_s)
         self._issued_ms = -1
         self._asking = ThreadPoolExecutor(1, "forecast")
         self._asked: Future[Forecast | None] | None = None
@@ -89,10 +96,9 @@ class Outward:
     def begin(self, twin: TwinDetail) -> None:
         """Find out what is published already."""
         self._sensors = sensors_of(twin)
-        look_ms = round(1000 * self._config.backfill.look_back_s)
         newest_ms = service_ms(twin.last_time) if twin.last_time else now_ms()
-        self._marks = Watermarks(newest_ms - look_ms)
-        self._read_marks(min(newest_ms, now_ms()) - look_ms)
+        self._marks = Watermarks(newest_ms - self._look_ms)
+        self._read_marks(min(newest_ms, now_ms()) - self._look_ms)
 
     def end(self) -> None:
         """Ask for nothing any more."""
@@ -100,14 +106,19 @@ class Outward:
 
     def settle(self) -> None:
         """Publish all that there is now."""
+        for _ in self.publish_again():
+            pass
         self.publish()
         if self._asked is not None:
             wait([self._asked])
             self._publish_forecast()
 
-    def publish_again(self) -> None:
-        """Publish residuals of samples that came late."""
-        self._publish_residuals(self._marks.since_ms)
+    def publish_again(self) -> Iterator[None]:
+        """Publish residuals of samples that came late, part by part."""
+        self._marks.forget_before(self._marks.newest_ms - self._look_ms)
+        for part in self._residuals(self._marks.since_ms):
+            self._publish_part(part)
+            yield
 
     def tell_away(self) -> None:
         """Let whoever watches Yamcs know that the service is away; Away if Yamcs is, too."""
@@ -121,7 +132,10 @@ class Outward:
         return True
 
     def publish(self) -> None:
-        self._publish_residuals(self._marks.newest_ms + 1 if self._marks.newest_ms >= 0 else self._marks.since_ms)
+        """Publish what is new."""
+        newest_ms = self._marks.newest_ms
+        for part in self._residuals(newest_ms + 1 if newest_ms >= 0 else self._marks.since_ms):
+            self._publish_part(part)
         self._publish_forecast()
         if self._is_due("health", self._config.health_s):
             self._publish_health()
@@ -140,28 +154,28 @@ class Outward:
         marks.events = self._gateway.event_keys(self._config.source, events_from_ms)
         self._events_from_ms = events_from_ms
 
-    def _publish_residuals(self, start_ms: int) -> None:
-        for part in self._residuals(start_ms):
-            rows = []
-            spread = part.model_extra["std_K"] if part.model_extra else {}
-            for k, text in enumerate(part.time):
-                time_ms = service_ms(text)
-                if time_ms in self._marks.residuals:
-                    continue
-                values: dict[str, float | str] = {self._name(VERSION): float(part.model_version[k])}
-                for sensor in self._sensors:
-                    for what, columns in (("residual", part.residual_K), ("residual_sigma", spread)):
-                        value = columns[sensor][k]
-                        if value is not None:
-                            values[self._name(sensor, what)] = value
-                nis = part.nis[k]
-                if nis is not None:
-                    values[self._name(NIS)] = nis
-                rows.append(Row(time_ms, values))
-            self._send(rows)
-            self._marks.residuals.update(row.time_ms for row in rows)
-            self._marks.newest_ms = max([self._marks.newest_ms, *(row.time_ms for row in rows)])
-            self._tally.residual_rows += len(rows)
+    def _publish_part(self, part: Residuals) -> None:
+        """Publish residuals, but for those whose generation time is there already."""
+        rows = []
+        spread = part.model_extra["std_K"] if part.model_extra else {}
+        for k, text in enumerate(part.time):
+            time_ms = service_ms(text)
+            if time_ms in self._marks.residuals:
+                continue
+            values: dict[str, float | str] = {self._name(VERSION): float(part.model_version[k])}
+            for sensor in self._sensors:
+                for what, columns in (("residual", part.residual_K), ("residual_sigma", spread)):
+                    value = columns[sensor][k]
+                    if value is not None:
+                        values[self._name(sensor, what)] = value
+            nis = part.nis[k]
+            if nis is not None:
+                values[self._name(NIS)] = nis
+            rows.append(Row(time_ms, values))
+        self._send(rows)
+        self._marks.residuals.update(row.time_ms for row in rows)
+        self._marks.newest_ms = max([self._marks.newest_ms, *(row.time_ms for row in rows)])
+        self._tally.residual_rows += len(rows)
 
     def _residuals(self, start_ms: int) -> Iterable[Residuals]:
         """Yield what the service holds from an instant on, in the order of time, in parts that it gives out whole."""

@@ -1,5 +1,6 @@
 """``twin import``: a model of another tool as a specification."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     from twin_core.interchange.imported import Imported
 
 FORMATS = ("xija", "esatan", "sinda")
+_HEADER = re.compile(r"^\s*HEADER\s+\w", re.IGNORECASE | re.MULTILINE)
+_PARTS = (".cc", ".k", ".hra")
+"""Ends of the names of SINDA files that hold a model: nodes and conductors, radiation, heat rates."""
 
 
 @click.command(
@@ -91,6 +95,8 @@ def import_model(
         raise click.UsageError("--over-time belongs to SINDA decks; other tools' arrays over time are always read")
     found = _read(kind, texts, columns, values, hidden, held, spread, over_time)
     refused = list(found.refused)
+    if not found.data.get("nodes"):
+        raise SpecError(_without_nodes(kind, files))
     if refused and not skip_unknown:
         raise SpecError(
             f"{refused[0]}; {len(refused)} thing(s) were not understood: leave them out with --skip-unknown", refused
@@ -118,10 +124,34 @@ def _text(file: Path) -> str:
 
 
 def _told(file: Path, text: str) -> str:
-    """Return what a file is."""
+    """Return what a file is; SpecError if it is none of the models that can be read."""
+    from twin_core.errors import SpecError
+
     if file.suffix == ".json":
         return "xija"
-    return "esatan" if "$MODEL" in text[:100_000].upper() else "sinda"
+    if "$MODEL" in text[:100_000].upper():
+        return "esatan"
+    if _HEADER.search(text):
+        return "sinda"
+    raise SpecError(
+        f"{file}: is no model that can be read: the JSON of Xija, an ESATAN-TMS deck ($MODEL ... $ENDMODEL), or SINDA "
+        "files (HEADER NODE DATA ...) such as .cc, .k and .hra"
+    )
+
+
+def _without_nodes(kind: str, files: tuple[Path, ...]) -> str:
+    """Return what to say of files that declare no node, such as the case file that a SINDA deck begins with."""
+    names = ", ".join(map(str, files))
+    if kind != "sinda":
+        return f"{names}: declares no node"
+    parts = [path for path in files[0].parent.iterdir() if path.suffix in _PARTS and path not in files]
+    beside = " ".join(str(path) for path in sorted(parts, key=lambda path: _PARTS.index(path.suffix)))
+    advice = (
+        f"give the files beside it too: twin import {' '.join(map(str, files))} {beside} --out SPEC"
+        if beside
+        else ("give the files that it inserts too (.cc with nodes and conductors, .k, .hra)")
+    )
+    return f"{names}: part of a SINDA deck that declares no node itself; {advice}"
 
 
 def _pairs(given: tuple[str, ...], option: str) -> dict[str, str]:

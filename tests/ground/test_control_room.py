@@ -146,11 +146,11 @@ def test_a_hidden_effect_is_seen_in_yamcs_and_in_open_mct(tmp_path: Path) -> Non
             link = finding.extra["link"]
             assert link == f"{service.url}/v1/twins/demo/diagnoses/{job.id}/report.html"
             assert "input_step" in client.report_html("demo", job)
-            look(tmp_path, service, client)
+            look(tmp_path, service, client, residual)
 
 
-def look(folder: Path, service: Server, client: Any) -> None:
-    """Find the same in Open MCT on the screen."""
+def look(folder: Path, service: Server, client: Any, residual: dict[int, float]) -> None:
+    """Find the same in Open MCT on the screen; ``residual`` is what stands in Yamcs of T_box, by generation time."""
     with openmct.served(service.url, folder) as url, Browser(folder / "profile", 1500, 1000) as page:
         page.open(f"{url}/?start=2026-03-01T00:00:00Z&stop=2026-03-02T00:00:00Z")
         page.until("document.querySelector('.c-tree')")
@@ -172,4 +172,15 @@ def look(folder: Path, service: Server, client: Any) -> None:
         sensors = {found.sensor for found in client.anomalies("demo")}
         page.until(f"{json.dumps(sorted(sensors))}.some((name) => document.body.innerText.includes(name + ' departs'))")
         page.until("document.body.innerText.includes('2026-03-01 11:')")
+        page.click('.c-tree [aria-label^="Navigate to T_box residual "]')
+        page.until("document.querySelector('.gl-plot-chart-area canvas')")
+        read = (
+            "(async () => (await openmct.telemetry.request(await openmct.objects.get("
+            "{namespace: 'thermal-twin', key: 'residual~demo~T_box'}), "
+            "{start: %d, end: %d, domain: 'utc'})).map((datum) => [datum.time, datum.residual]))()"
+        )
+        assert dict(map(tuple, page.evaluate(read % span))) == pytest.approx(residual)
+        page.evaluate("void openmct.time.setBounds({start: Date.now() - 3600000, end: Date.now() + 60000})")
+        page.click('.c-tree [aria-label^="Navigate to Findings "]')
+        page.until("document.body.innerText.includes('input_step at channel Q_box')")
         assert page.troubles == []

@@ -18,7 +18,7 @@ from replay.bridges.config import YamcsConfig
 from replay.bridges.foxglove_messages import GRID_TOPIC, LOG_TOPIC
 from replay.cli.main import main
 from tests.ground.openmct import DIST, NODE
-from tests.ground.test_yamcs import feed
+from tests.ground.test_yamcs import feed, published, until
 from tests.ground.yamcs import Yamcs
 from tests.replay.test_convert import GPS_S, SPEC, packet, rows, xtce
 from tests.replay.test_foxglove import heard, messages, viewer
@@ -55,16 +55,34 @@ def test_the_configuration_is_one() -> None:
 def test_first_steps_with_yamcs(
     yamcs: Yamcs, service: Server, config_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Every command of the section in its order; the server has the XTCE that the third one writes."""
     (tmp_path / "sat.yaml").write_text(yaml.safe_dump(BENCHSAT))
     monkeypatch.chdir(tmp_path)
-    feed(yamcs, 0, 20)
-    lines = commands("Yamcs")
-    assert [line.split()[:3] for line in lines] == [["twin", "bridge", word] for word in ("xtce", "limits", "yamcs")]
-    for line in lines:
-        words = shlex.split(line.replace("$YAMCS", yamcs.url))[1:]
-        assert main(words + (["--service", service.url] if words[1] != "limits" else [])) == 0, line
+    client = service.client()
+    client.delete("benchsat")
+    feed(yamcs, 0, 60)
+    *first, once, calibrate, follow = (
+        line.replace("$YAMCS", yamcs.url).replace("http://127.0.0.1:8000", service.url) for line in commands("Yamcs")
+    )
+    assert [line.split()[1] for line in first] == ["bridge", "register", "bridge"]
+    elsewhere = ["--service", service.url]
+    for line in (*first, once):
+        words = shlex.split(line)[1:]
+        assert main(words + (elsewhere if words[1] in ("xtce", "yamcs") else [])) == 0, line
+    declared = client.twin("benchsat").specification["channels"]["T_px"]["limits"]
+    assert declared["red"] == pytest.approx([253.15, 323.15])  # °C of the mission
     assert "THERMAL_TWIN" in (tmp_path / "thermal-twin.xml").read_text()
-    assert service.client().twin("benchsat").samples == 20
+    assert client.twin("benchsat").samples == 60
+    subprocess.run(["bash", "-ec", calibrate], check=True, capture_output=True)
+    words = [sys.executable, "-m", "replay.cli.main", *shlex.split(follow)[1:], *elsewhere]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            until(lambda: len(published(yamcs, "T_px/residual")) == 60, "residuals are there")
+        finally:
+            process.send_signal(signal.SIGINT)
+        assert process.wait(60) == 0 and process.stdout is not None
+        assert "residual_rows 60" in process.stdout.read()
 
 
 def test_files_are_converted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,10 +2,10 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -250,6 +250,48 @@ def test_what_is_dumped_late_fills_the_gap(
         until(lambda: client.twin("benchsat").samples == 120, "the gap is filled")
         until(lambda: len(published(yamcs, "nis")) >= 120, "and so are the residuals")
     assert_once_each(published(yamcs, "nis"), range(120))
+
+
+def test_what_is_live_does_not_wait_for_the_archive(
+    yamcs: Yamcs, service: Server, client: TwinClient, config: YamcsConfig
+) -> None:
+    from replay.bridges.yamcs_bridge import YamcsBridge
+    from replay.bridges.yamcs_gateway import Row, YamcsGateway
+
+    class SlowArchive(YamcsGateway):
+        """Reads its archive slowly; notes which residuals are published meanwhile."""
+
+        is_reading = False
+        meanwhile: ClassVar[set[int]] = set()
+
+        def history(self, *span: Any) -> Iterator[Row]:
+            self.is_reading = True
+            for row in super().history(*span):
+                time.sleep(0.05)
+                yield row
+            self.is_reading = False
+
+        def publish(self, stream: str, rows: Sequence[Row]) -> int:
+            if self.is_reading:
+                self.meanwhile.update(row.time_ms for row in rows if f"{TOP}/model_version" in row.values)
+            return super().publish(stream, rows)
+
+    often = config.model_copy(update={"backfill": config.backfill.model_copy(update={"every_s": 1.0})})
+    feed(yamcs, 0, 60)
+    make_bridge(often, yamcs, service).run(once=True)
+    client.wait("benchsat", client.calibrate("benchsat"))
+    slow = YamcsBridge(
+        often, lambda: SlowArchive(yamcs.url, "sat"), service.client(), service.url, lambda _: None, poll_s=0.1
+    )
+    with running(slow):
+        until(lambda: len(published(yamcs, "nis")) == 60, "the first residuals are there")
+        for k in range(60, 100):
+            feed(yamcs, k, k + 1)
+            time.sleep(0.2)
+        until(lambda: len(published(yamcs, "nis")) >= 100, "all residuals are there")
+        until(lambda: SlowArchive.meanwhile, "residuals are published while the archive is read")
+    assert_once_each(published(yamcs, "nis"), range(100))
+    assert client.twin("benchsat").samples == 100
 
 
 def test_wrong_credentials_are_told_and_right_ones_pass(

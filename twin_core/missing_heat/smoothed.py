@@ -95,9 +95,15 @@ class NodeHeat:
         """Whether the findings' heat is the missing heat; None without one, or where the band is wider than it."""
         if self.effect_W is None or _rms(self.effect_W) < BAND * self.band_W:
             return None
+        return self._is_alike or (self.correlation or 0.0) >= CORRELATED
+
+    @property
+    def _is_alike(self) -> bool:
+        """Whether both heats are the same in size."""
+        if self.effect_W is None:
+            return False
         apart = _rms(self.effect_W - self.mean_W)
-        alike = apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
-        return alike or (self.correlation or 0.0) >= CORRELATED
+        return apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
 
     def _following(self) -> str:
         """Return what the swings follow, as a sentence."""
@@ -134,7 +140,9 @@ class NodeHeat:
             return seen
         supplied = self.effect_W.mean()
         verdict = {
-            True: "the two agree",
+            True: "the two agree"
+            if self._is_alike
+            else "the two rise and fall together, and declared parameters had taken up a part",
             False: "the two differ, as they do where declared parameters had taken up a part of that heat",
             None: "the uncertainty is too wide to compare them",
         }[self.agrees]

@@ -79,6 +79,7 @@ def _template() -> "Template":
     )
     for function in (
         phrasing.in_words,
+        phrasing.kelvin,
         phrasing.number,
         phrasing.parameters,
         phrasing.place,
@@ -196,13 +197,21 @@ def _flows(report: Mapping[str, Any]) -> list[Json]:
         rows += [_flow("load", load["channel"], load["node"], load["heat_W"]) for load in phase["loads"]]
         rows += [_flow("heater", "heater", heater["node"], heater["heat_W"]) for heater in phase["heaters"]]
         for effect in phase["effects"]:
-            name = phrasing.in_words(effect["effect"])
-            rows += [_flow("found", name, node, heat) for node, heat in effect["heat_W"].items()]
+            rows += _flows_of(phrasing.in_words(effect["effect"]), effect["heat_W"])
         rows.sort(key=lambda row: -row["heat_W"])
         hidden = max(len(rows) - _MOST_FLOWS, 0) + phase.get("links_left_out", 0)
         told = {key: phase[key] for key in ("phase", "start", "stop")}
         found.append(told | {"rows": rows[:_MOST_FLOWS], "hidden": hidden, "picture": draw_flows(phase)})
     return found
+
+
+def _flows_of(effect: str, heat_W: Mapping[str, float]) -> list[Json]:
+    """Return what an effect brings to each node; one flow where one node gets what another one gives."""
+    if len(heat_W) == 2:
+        (source, lost_W), (target, gained_W) = heat_W.items()
+        if math.isclose(lost_W, -gained_W):
+            return [_flow(f"found: {effect}", source, target, gained_W)]
+    return [_flow("found", effect, node, heat) for node, heat in heat_W.items()]
 
 
 def _flow(kind: str, source: str, target: str, heat_W: float) -> Json:

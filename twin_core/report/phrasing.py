@@ -137,6 +137,13 @@ def number(value: Any, digits: int = 3) -> str:
     return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
 
 
+def kelvin(value: Any) -> str:
+    """Return a deviation in K to the millikelvin, so that a column of them can be compared; a dash where there is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    return f"{round(value, 3) + 0.0:.3f}".replace("-", "−")
+
+
 def unit(plain: str) -> str:
     """Return a unit as it is printed: ``m²`` for ``m2``."""
     return plain.replace("m2", "m²").replace("^2", "²")

@@ -1,11 +1,12 @@
-/** The object tree: twins, their sensors with what is forecast and what is left over, inputs, anomalies. */
+/** The object tree: twins, their sensors with what is forecast and what is left over, inputs, anomalies, findings. */
 
 export const KIND = {
   twin: 'thermal-twin.twin',
   measured: 'thermal-twin.measured',
   forecast: 'thermal-twin.forecast',
   residual: 'thermal-twin.residual',
-  anomalies: 'thermal-twin.anomalies'
+  anomalies: 'thermal-twin.anomalies',
+  findings: 'thermal-twin.findings'
 };
 
 const TIME = { key: 'utc', source: 'time', name: 'Time', format: 'utc', hints: { domain: 1 } };
@@ -30,7 +31,8 @@ const TYPES = {
   [KIND.measured]: ['Telemetry of a twin', 'icon-telemetry'],
   [KIND.forecast]: ['Forecast', 'icon-telemetry'],
   [KIND.residual]: ['Residual', 'icon-telemetry'],
-  [KIND.anomalies]: ['Anomalies', 'icon-alert-rect']
+  [KIND.anomalies]: ['Anomalies', 'icon-alert-rect'],
+  [KIND.findings]: ['Findings', 'icon-magnify']
 };
 
 /** Splits the key of an object: kind, twin and channel. Ids of twins hold no tilde; channels come last. */
@@ -83,6 +85,12 @@ export class Objects {
       return {
         identifier, name: 'Anomalies', type: KIND.anomalies, location: this.keyString('twin', twin),
         telemetry: { values: anomalyValues() }
+      };
+    }
+    if (kind === 'findings') {
+      return {
+        identifier, name: 'Findings', type: KIND.findings, location: this.keyString('twin', twin),
+        telemetry: { values: findingValues() }
       };
     }
     const declared = await this.channel(twin, channel);
@@ -148,6 +156,7 @@ export class Objects {
     const sensors = names.filter((name) => sensed.has(name));
     return [
       this.id('anomalies', twin),
+      this.id('findings', twin),
       ...sensors.flatMap((name) => [this.id('sensor', twin, name), this.id('residual', twin, name)]),
       ...names.filter((name) => !sensors.includes(name)).map((name) => this.id('measured', twin, name))
     ];
@@ -158,8 +167,13 @@ function range(key, name, unit, priority) {
   return { key, name, unit: unit ?? undefined, format: 'number', hints: { range: priority } };
 }
 
+const text = (key, name) => ({ key, name, format: 'string' });
+
+function findingValues() {
+  return [TIME, { ...text('message', 'Event'), hints: { label: 0 } }, text('effect', 'Effect'), text('report', 'Report')];
+}
+
 function anomalyValues() {
-  const text = (key, name) => ({ key, name, format: 'string' });
   return [TIME, { ...text('message', 'Event'), hints: { label: 0 } }, text('sensor', 'Sensor'), text('state', 'State'), text('cause', 'Cause'),
     { key: 'score', name: 'Score', format: 'number' }];
 }

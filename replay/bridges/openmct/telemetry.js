@@ -2,7 +2,7 @@
 
 import { FORECASTS, KIND, parts } from './objects.js';
 
-const OURS = new Set([KIND.measured, KIND.forecast, KIND.residual, KIND.anomalies]);
+const OURS = new Set([KIND.measured, KIND.forecast, KIND.residual, KIND.anomalies, KIND.findings]);
 const MOST_STEPS = 500;
 const LEAST_STEP_S = 1;
 const MOST_AHEAD_S = 7 * 86_400;
@@ -108,11 +108,42 @@ export class Telemetry {
     return (found?.anomalies ?? []).map(event).sort((a, b) => a.time - b.time);
   }
 
+  /** What diagnoses found, at the time that they ended. */
+  async findings(twin, _, options) {
+    const found = await this.api.get(`v1/twins/${twin}/diagnoses`, {}, options.signal);
+    return (found?.jobs ?? []).flatMap((job) => this.told(twin, job)).sort((a, b) => a.time - b.time);
+  }
+
+  /** Returns one event per finding of a diagnosis, or one that it found nothing. */
+  told(twin, job) {
+    if (job.state !== 'succeeded' || !job.result) {
+      return [];
+    }
+    const report = `${this.api.base}v1/twins/${twin}/diagnoses/${job.id}/report.html`;
+    const findings = job.result.findings ?? [];
+    const events = findings.length
+      ? findings.map((finding) => ({ message: words(finding), effect: finding.effect }))
+      : [{ message: `${job.result.verdict ?? ''}`.replaceAll('_', ' '), effect: '' }];
+    return events.map((told, k) => ({ id: `${job.id}~${k}`, time: instant(job.finished), ...told, report }));
+  }
+
+  followFindings(twin, callback) {
+    return this.streams.listen(twin, async (message) => {
+      if (message.type === 'job' && message.job.kind === 'diagnosis' && message.job.state === 'succeeded') {
+        const job = await this.api.get(`v1/twins/${twin}/diagnoses/${message.job.id}`);
+        this.told(twin, job).forEach(callback);
+      }
+    });
+  }
+
   subscribe(object, callback) {
     const { kind, twin, channel } = parts(object.identifier);
     const live = { measured: liveValues, residual: liveResiduals, anomalies: liveAnomalies }[kind];
     if (kind in FORECASTS) {
       return this.followForecast(kind, twin, channel, callback);
+    }
+    if (kind === 'findings') {
+      return this.followFindings(twin, callback);
     }
     let last = null;
     return this.streams.listen(twin, async (message) => {
@@ -221,6 +252,21 @@ function event(anomaly) {
     state: anomaly.stop === null ? 'lasts' : `until ${anomaly.stop}`,
     cause: anomaly.cause ? `${anomaly.cause.effect}` : ''
   };
+}
+
+/** A finding in one line: effect, place, parameters with their standard deviation. */
+function words({ effect, where, parameters }) {
+  const place = Object.entries(where).map(([key, value]) => `${key} ${[value].flat().join(' - ')}`).join(', ');
+  const numbers = Object.entries(parameters).map(([name, value]) => `${name} = ${span(value)}`).join(', ');
+  return `${effect} at ${place}${numbers && `: ${numbers}`}`;
+}
+
+function span(value) {
+  if (typeof value?.mean !== 'number') {
+    return Array.isArray(value) || typeof value === 'object' ? JSON.stringify(value) : `${value}`;
+  }
+  const short = (number, digits) => `${Number(number.toPrecision(digits))}`;
+  return short(value.mean, 4) + (typeof value.std === 'number' ? ` ± ${short(value.std, 2)}` : '');
 }
 
 function liveValues(message, channel) {

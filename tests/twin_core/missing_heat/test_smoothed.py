@@ -119,7 +119,7 @@ WAVE = np.sin(np.arange(50.0) / 5.0)
     [
         (5.0 + WAVE, 5.2 + WAVE, 0.5, True, "the two agree"),
         (5.0, 5.2 + WAVE, 0.5, True, "the two agree"),
-        (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "the two agree"),
+        (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "rise and fall together"),
         (5.0 + WAVE, -4.0 - WAVE, 0.5, False, "the two differ"),
         (0.3 * WAVE, -4.0 + 0.3 * WAVE, 2.0, None, "too wide"),
         (None, 4.0, 0.5, None, "on average"),
