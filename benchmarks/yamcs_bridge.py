@@ -5,6 +5,7 @@ A real Yamcs server and a real service on this machine. ``python -m benchmarks.y
 """
 
 import multiprocessing
+import os
 import tempfile
 import threading
 import time
@@ -119,6 +120,7 @@ def _update(value: float, time_ms: int) -> Any:
 
 def measure(n_nodes: int, n_times: int, n_live: int, *, busy: int = 0) -> tuple[list[str], list[str]]:
     """Return one row of the table of rates, and one of that of delays, beside so many processes that never rest."""
+    load = os.getloadavg()[0]
     found, power = telemetry(n_nodes, n_times + n_live + 1)
     with both(n_nodes) as (config, yamcs, client, url), YamcsGateway(yamcs.url, "sat") as gateway, beside(busy):
         gateway.publish("pp_realtime", rows_of(found, power, 0, 50))  # Java warms up
@@ -141,7 +143,7 @@ def measure(n_nodes: int, n_times: int, n_live: int, *, busy: int = 0) -> tuple[
         tally = bridge().run(once=True)
         out_of_twin = tally.published_values / (time.perf_counter() - begun)
         residuals, forecasts = live(bridge(), config, gateway, rows_of(found, power, n_times, n_times + n_live + 1))
-    case = [str(n_nodes), str(busy)]
+    case = [str(n_nodes), str(busy), f"{load:.0f}"]
     rates = [*case, *(f"{x:,.0f}" for x in (into_twin, out_of_twin, into_yamcs, one_by_one))]
     return rates, [*case, *_told(residuals, n_live), *_told(forecasts, len(forecasts))]
 
@@ -214,9 +216,9 @@ def _until(condition: Callable[[], bool]) -> None:
 
 def main() -> None:
     """Measure, print and save."""
-    results = [measure(n_nodes, 3000, 60) for n_nodes in (1, 2, 10, 20)]
-    results.append(measure(10, 3000, 60, busy=2))
-    case = ["sensors", "busy processes beside"]
+    results = [measure(n_nodes, 5000, 60) for n_nodes in (1, 2, 10, 20)]
+    results.append(measure(10, 5000, 60, busy=2))
+    case = ["sensors", "busy processes beside", "load before"]
     rates = markdown_table(
         [
             *case,
@@ -230,14 +232,15 @@ def main() -> None:
     quantiles = ["median, ms", "95 %, ms", "longest, ms"]
     delays = markdown_table([*case, "residuals", *quantiles, "forecasts", *quantiles], [delay for _, delay in results])
     note = (
-        "Rates: the archive of 3000 samples through the bridge into an empty twin (log-in, reading back and health included); "
+        "Rates: the archive of 5000 samples through the bridge into an empty twin (log-in, reading back and health included); "
         "residuals, forecasts and events of all of them back; what the parameter stream takes by itself; the same with one "
         "request per value. Delay: from a sample being sent to Yamcs to its residual being heard from Yamcs, and to the "
         "forecast of the instant one hour behind the sample being heard, through the bridge (`--poll 0.1`), the service's commit "
         "and its filter; one sample every 0.5 s, which is twenty times as fast as its time, so that forecasts are asked for "
         "twenty times as often as in operation. With few sensors the first two rates are mostly the seconds that a connection "
         "takes to begin (checks of every name, reading back). Yamcs, the service, its workers and the bridge share the two "
-        "cores; busy processes beside them never rest."
+        "cores; busy processes beside them never rest; the load before is that of other work on the machine, in processes that "
+        "would run."
     )
     print(rates, delays, sep="\n")
     save_table("yamcs_bridge", "Yamcs and a twin", rates + "\n" + delays, "benchmarks.yamcs_bridge", note)

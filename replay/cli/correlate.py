@@ -42,6 +42,12 @@ PHASE = "phase"
     type=click.Choice(["squared", "huber"]),
     help="huber for readings with outliers.",
 )
+@click.option(
+    "--free",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Vary the N parameters that the sensors tell most of; the others keep their guesses.  [default: all]",
+)
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--out", required=True, type=FILE, help="Folder for report.json, report.html and model.json.")
@@ -53,6 +59,7 @@ def correlate(
     steady: tuple[Path, ...],
     transient: tuple[Path, ...],
     loss: str,
+    free: int | None,
     no_masking: bool,
     deadline: float | None,
     out: Path,
@@ -85,10 +92,19 @@ def correlate(
     phases = [phase for path in steady for phase in balance_phases(path, spec, flown)]
     phases += [Phase(Path(record.name).stem, record, False) for record in flown]
     with progress_bar("correlating") as progress:
-        found = run(spec, phases, loss="huber" if loss == "huber" else "squared", deadline=stop, progress=progress)
+        found = run(
+            spec,
+            phases,
+            loss="huber" if loss == "huber" else "squared",
+            most_free=free,
+            deadline=stop,
+            progress=progress,
+        )
     report = found.report
     report["sensitivity"] = sensitivity(found.calibration)
     report["provenance"] = provenance(spec, [phase.record for phase in phases])
+    for row, phase in zip(report["provenance"]["telemetry"], phases, strict=True):
+        row["steady"] = phase.steady
     report["document"] = document(author, [spec_file, *steady, *transient])
     drawn = limits(spec, found.model.noise_K)
     plots = {"criteria": spec.criteria.model_dump(), "phases": found.plots, "limits": drawn}

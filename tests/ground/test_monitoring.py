@@ -15,7 +15,7 @@ from tests.ground.openmct import NODE
 
 ROOT = Path(__file__).parents[2]
 BRIDGES = ROOT / "replay" / "bridges"
-RULES = BRIDGES / "prometheus" / "rules.yml"
+RULES = BRIDGES / "prometheus" / "rules.yaml"
 PROMTOOL = shutil.which("promtool")
 SCHEMA = ROOT / ".venv" / "grafana" / "node_modules"
 pytestmark = pytest.mark.ground

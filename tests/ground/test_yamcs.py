@@ -380,6 +380,37 @@ def test_a_forecast_beyond_a_limit_is_an_alarm_of_yamcs(
         assert {(alarm.name, alarm.severity) for alarm in alarms.list_alarms()} == {(f"{TOP}/T_px/q95", "CRITICAL")}
 
 
+def test_limits_exceeded_and_forecast_are_events(
+    yamcs: Yamcs, service: Server, client: TwinClient, config: YamcsConfig
+) -> None:
+    """The workbench of these tests expects that the last reading stays; the red limit is 320 K, and 320 K is not beyond it."""
+    from replay.bridges.yamcs_gateway import Row, YamcsGateway
+
+    def send(first: int, stop: int, reading_K: float) -> None:
+        other = {"/SAT/thermal/T_tank": 15.0, "/SAT/eps/Q_px": 500.0}
+        rows = [
+            Row(T0_MS + k * STEP_MS, {"/SAT/thermal/T_px": reading_K - 273.15, **other}) for k in range(first, stop)
+        ]
+        with YamcsGateway(yamcs.url, "sat") as gateway:
+            gateway.publish("pp_realtime", rows)
+
+    send(0, 59, 320.0)
+    make_bridge(config, yamcs, service).run(once=True)
+    client.wait("benchsat", client.calibrate("benchsat"))
+    with running(make_bridge(config, yamcs, service)):
+        send(59, 60, 320.0)
+        until(lambda: "LIMIT_FORECAST" in {event.event_type for event in events(yamcs)}, "the forecast is told")
+        assert "LIMIT" not in {event.event_type for event in events(yamcs)}
+        send(60, 63, 321.0)
+        until(lambda: "LIMIT" in {event.event_type for event in events(yamcs)}, "the limit is told")
+        send(63, 66, 300.0)
+        until(lambda: {"LIMIT_ENDED", "LIMIT_FORECAST_ENDED"} <= {e.event_type for e in events(yamcs)}, "both end")
+    said = {event.event_type: event for event in events(yamcs)}
+    assert said["LIMIT_FORECAST"].severity == "DISTRESS" and said["LIMIT"].severity == "CRITICAL"
+    assert said["LIMIT"].generation_time.timestamp() * 1000 == T0_MS + 60 * STEP_MS
+    assert said["LIMIT_ENDED"].severity == "INFO"
+
+
 def test_the_service_may_be_away_at_first(yamcs: Yamcs, service: Server, config: YamcsConfig) -> None:
     service.kill()
     with pytest.raises(Away):

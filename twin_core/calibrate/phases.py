@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
+from twin_core.calibrate.choice import by_sensitivity
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.explained import explained
 from twin_core.calibrate.noise import sensor_noise_K
@@ -28,6 +29,7 @@ SETTLED = 20.0
 is gone, were it slower by a factor of three."""
 SAMPLES_AT_REST = (50, 2000)
 """Fewest and most samples that stand for a phase at rest; in between it counts as much as the longest transient."""
+MOST_NAMED = 20
 MOST_DRAWN = 3000
 """Samples of a transient in a picture."""
 LONGEST_S = 1e9
@@ -153,6 +155,7 @@ def correlate(
     phases: Sequence[Phase],
     *,
     loss: Loss = "squared",
+    most_free: int | None = None,
     deadline: float = NO_DEADLINE,
     progress: Progress = no_progress,
 ) -> Correlation:
@@ -166,6 +169,8 @@ def correlate(
         At rest or transient; each has its own initial state.
     loss, deadline, progress
         As in ``twin_core.calibrate.calibrate``.
+    most_free
+        Vary at most so many parameters, those that the sensors tell most of; the others keep their guesses. All by default.
 
     Returns
     -------
@@ -185,6 +190,10 @@ def correlate(
         raise TelemetryError(f"{twice}: two phases have this name; each counts once")
     stated = _with_noise(spec, [phase.record for phase in phases if not phase.steady])
     records = [phase.record for phase in phases]
+    held: tuple[str, ...] = ()
+    if most_free is not None:
+        progress(0.0, "choosing what to vary")
+        stated, held = by_sensitivity(stated, records, most_free)
     calibration = fit_trajectories(stated, records, loss=loss, deadline=deadline, progress=progress)
     model = explained(to_model(calibration, ()), calibration, deadline=deadline)
     declared = _as_declared(calibration.problem)
@@ -208,7 +217,7 @@ def correlate(
         "parameters": _rows(model, calibration),
         "correlations": model.summary["correlations"],
         "words": [line for line in model.summary["words"] if "never changes" not in line],
-        "notices": model.summary["notices"],
+        "notices": [*_told_held(held), *model.summary["notices"]],
     }
     plots = {
         phase.name: _series(spec, phase, measured[i], {when: tables[when][i] for when in tables})
@@ -216,6 +225,15 @@ def correlate(
         if not phase.steady
     }
     return Correlation(model, calibration, report, plots)
+
+
+def _told_held(names: Sequence[str]) -> list[str]:
+    """Return what to say of parameters that were not varied."""
+    if not names:
+        return []
+    shown = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+    kept = "1 parameter keeps its guess" if len(names) == 1 else f"{len(names)} parameters keep their guesses"
+    return [f"{kept}, for the sensors tell more of the others: {shown}"]
 
 
 def _series(spec: TwinSpec, phase: Phase, measured_K: FloatArray, tables: Mapping[str, FloatArray]) -> Json:

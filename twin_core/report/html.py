@@ -79,6 +79,7 @@ def _template() -> "Template":
     )
     for function in (
         phrasing.in_words,
+        phrasing.instant,
         phrasing.kelvin,
         phrasing.number,
         phrasing.parameters,

@@ -144,6 +144,11 @@ def kelvin(value: Any) -> str:
     return f"{round(value, 3) + 0.0:.3f}".replace("-", "−")
 
 
+def instant(value: Any) -> str:
+    """Return an instant in the telemetry's own form: a date as it is, seconds with their unit."""
+    return f"{value:.12g} s" if isinstance(value, int | float) else str(value)
+
+
 def unit(plain: str) -> str:
     """Return a unit as it is printed: ``m²`` for ``m2``."""
     return plain.replace("m2", "m²").replace("^2", "²")
