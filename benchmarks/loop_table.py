@@ -71,7 +71,11 @@ def targets(rows: Sequence[Row]) -> str:
             for group, least in (("two", ">= 85 %"), ("three", ">= 70 %"))
         ),
         *(
-            [f"{group} effects: at least the larger one", ">= 97 %", _share(groups[group], lambda r: r["own"] is not None)]
+            [
+                f"{group} effects: at least the larger one",
+                ">= 97 %",
+                _share(groups[group], lambda r: r["own"] is not None),
+            ]
             for group in ("two", "three")
         ),
         *(
