@@ -127,7 +127,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if not widened or (told and stands(state.trial, by_heat.trial)):
+    after = by_heat.trial
+    if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
         return bool(told)
     beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
