@@ -19,6 +19,7 @@ from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
     NO_MORE,
+    OUTDONE,
     SMALL_REMAINDER,
     Finding,
     Judged,
@@ -47,6 +48,9 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
+
+N_EXCHANGED = 2
+"""Refused options that are tried in the place of a finding."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -87,7 +91,11 @@ def search(
     needed = threshold(false_alarm_rate)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
-        if not _extend(state, needed, fallback=False):
+        before = state.fork()
+        extended = _extend(state, needed, fallback=False)
+        if exchange(before, state.rejected[len(before.rejected) :], needed):
+            state.join(before)
+        elif not extended:
             break
         prune(state, needed)
     withdraw(state, needed)
@@ -298,6 +306,44 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
     if examined is not None and examined[0].reason not in ("", SMALL_REMAINDER):
         state.rejected.append(examined[0])
         _drop(state, places, *without)
+
+
+def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
+    """Put an effect that was refused beside a finding in its place, if both act there and it explains more; False if none does.
+
+    The first look may take a part of what is missing for the whole: a heater that came on once for a load with an onset. What
+    switches it off again is then tried beside it, where it does not belong.
+    """
+    layout = state.trial.fit.network.layout
+    for option in sorted(refused, key=worth)[:N_EXCHANGED]:
+        for finding in state.findings:
+            here, there = ({n for e in j.effects for n in touched_nodes(e, layout)} for j in (option, finding.judged))
+            if here & there and len(option.effects) == 1 and worth(option) < worth(finding.judged):
+                replaced = partial(_in_place_of, state, finding, option, needed)
+                if state.attempt(replaced, f"{option.labels} in place of {finding.judged.labels}"):
+                    return True
+    return False
+
+
+def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float) -> bool:
+    """Take an option instead of a finding, if it is likelier by the odds asked for and passes; return whether it did."""
+    places = {effect.place for effect in finding.effects}
+    kept = _attempted_without(state, places)
+    if kept is None:
+        return False
+    without, lost = kept
+    trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
+    instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
+    if instead.evidence.log_bayes_factor <= lost + needed:
+        return False
+    examined, _ = examine(without, instead, needed)
+    if examined.reason:
+        return False
+    state.rejected = [j for j in state.rejected if j.effects != option.effects]
+    state.rejected.append(replace(finding.judged, reason=OUTDONE))
+    state.findings = [Finding(examined) if f is finding else f for f in state.findings]
+    state.trial = trial
+    return True
 
 
 def prune(state: Search, needed: float) -> None:

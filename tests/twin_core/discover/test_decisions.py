@@ -20,6 +20,7 @@ from twin_core.discover.judge import (
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
+    OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     Finding,
@@ -43,7 +44,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import _name_what_leaves_little, withdraw
+from twin_core.discover.search import _name_what_leaves_little, exchange, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -417,6 +418,39 @@ def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(found: float
     named = names == ["a"]
     assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
     assert (state.trial is likely.trial) == named
+
+
+def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
+    effect = REGISTRY[kind]({"node": node}, {})
+    return Judged((effect,), Evidence(nats, 0.0), stub(effect), None, reason)
+
+
+@pytest.mark.parametrize(
+    ("option", "alone", "reason", "named"),
+    [
+        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED + JUST, "", "thermostat_heater"),
+        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED, "", "heat_load_step"),
+        (kind_at("thermostat_heater", "n0", 90.0), 99.0, NO_LAW, "heat_load_step"),
+        (kind_at("thermostat_heater", "n0", 20.0), 99.0, "", "heat_load_step"),
+        (kind_at("thermostat_heater", "n1", 90.0), 99.0, "", "heat_load_step"),
+    ],
+    ids=["explains more", "hardly more", "is no law", "was worth less beside it", "acts elsewhere"],
+)
+def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
+    monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
+) -> None:
+    monkeypatch.setattr(searching, "touched_nodes", lambda effect, layout: {effect.where["node"]})
+    monkeypatch.setattr(searching, "_attempted_without", lambda state, places: (stub(), 30.0))
+    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(searching, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    found = kind_at("heat_load_step", "n0", 30.0)
+    cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
+    refused = replace(option, reason=NO_FORESIGHT)
+    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[refused])
+    assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
+    assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
+    assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
