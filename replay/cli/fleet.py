@@ -54,7 +54,7 @@ def close_fleet(fleet: Path, executor: str, out: Path, options: Json, *, masking
     """
     from replay.cli.console import progress_bar, to_json
     from replay.cli.recordings import load_records
-    from service.jobs.executor import Cancel, JobFailed, ProcessPerTask, Tasks
+    from service.jobs.executor import JobFailed, ProcessPerTask, Task, Tasks
     from twin_core.files import make_folder, write_text
     from twin_core.network.spec_io import load_spec
 
@@ -70,7 +70,7 @@ def close_fleet(fleet: Path, executor: str, out: Path, options: Json, *, masking
         for folder, spec_file, files in folders_of(fleet):
             spec = load_spec(spec_file)
             work = (spec, load_records(tuple(files), spec, masking=masking), options)
-            running[tasks.start(close_one, work, {}, lambda fraction, message: None, Cancel())] = folder.name
+            running[tasks.start(Task(close_one, work))] = folder.name
         with progress_bar("closing the loops") as progress:
             for done, future in enumerate(as_completed(running), start=1):
                 name = running[future]

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from service.jobs.executor import Cancel, ExecutorLost, JobFailed, Tasks
+from service.jobs.executor import ExecutorLost, JobFailed, Task, Tasks
 from twin_core.errors import TwinError
 
 T = TypeVar("T")
@@ -29,9 +29,9 @@ class DaskTasks(Tasks):
         self._lock = threading.Lock()
         self._client: Client | None = None
 
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def shutdown(self) -> None:
         """End every task and let go of the cluster."""
-        super().shutdown(wait, cancel_futures=cancel_futures)
+        super().shutdown()
         with self._lock:
             if self._client is not None:
                 self._client.close(timeout=2)
@@ -45,23 +45,16 @@ class DaskTasks(Tasks):
                     raise ExecutorLost(f"no scheduler answers at {self._address}") from error
             return self._client
 
-    def _supervise(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> T:
+    def _supervise(self, task: Task[T]) -> T:
         client = self._connected()
         topic = f"twin-{uuid.uuid4().hex}"
-        future = client.get_executor(pure=False, retries=2).submit(_run, topic, function, args, kwargs)
-        client.subscribe_topic(topic, lambda event: progress(*event[1]))
+        future = client.get_executor(pure=False, retries=2).submit(_run, topic, task.function, task.args)
+        client.subscribe_topic(topic, lambda event: task.progress(*event[1]))
         until_s = time.monotonic() + self._deadline_s
         seen_s = time.monotonic()
         try:
             while not future.done():
-                self._raise_if_over(until_s, cancel)
+                self._raise_if_over(until_s, task.cancel)
                 if client.status == "running":
                     seen_s = time.monotonic()
                 elif time.monotonic() - seen_s > AWAY_S:
@@ -80,7 +73,7 @@ class DaskTasks(Tasks):
         return done
 
 
-def _run(topic: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> tuple[Any, ...]:
+def _run(topic: str, function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, ...]:
     """Do the task in a worker of the cluster; what went wrong comes back as a value, so that it is not tried again."""
     worker = get_worker()
 
@@ -88,7 +81,7 @@ def _run(topic: str, function: Callable[..., Any], args: tuple[Any, ...], kwargs
         worker.log_event(topic, (float(fraction), str(message)))
 
     try:
-        return ("done", function(*args, progress=progress, **kwargs))
+        return ("done", function(*args, progress=progress))
     except TwinError as error:
         return ("failed", str(error))
     except Exception as error:

@@ -1,4 +1,4 @@
-"""An executor whose every task runs in a process of its own, which can be ended at any moment.
+"""What computes jobs: every task runs in a process of its own, which can be ended at any moment.
 
 ``ProcessPoolExecutor`` shares processes between tasks, and a worker that dies or is ended takes the whole pool with
 it. Here a task that crashes, hangs or is cancelled harms nobody else.
@@ -16,15 +16,16 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, TypeVar
 
+from twin_core._typing import Progress, no_progress
 from twin_core.errors import TwinError
 
-P = ParamSpec("P")
 T = TypeVar("T")
 
 END_GRACE_S = 2.0
@@ -67,6 +68,26 @@ class Cancel:
         return self._event.is_set()
 
 
+@dataclass(frozen=True)
+class Task(Generic[T]):
+    """``function(*args, progress=...)``, to be computed in another process.
+
+    Attributes
+    ----------
+    function
+        Found by its name over there; its arguments and what it returns travel.
+    progress
+        Called in a thread of this process.
+    cancel
+        Ends it from any thread.
+    """
+
+    function: Callable[..., T]
+    args: tuple[Any, ...] = ()
+    progress: Progress = no_progress
+    cancel: Cancel = field(default_factory=Cancel)
+
+
 class Tasks(ABC):
     """What computes tasks, here or elsewhere: a thread watches each, so many at a time."""
 
@@ -76,24 +97,14 @@ class Tasks(ABC):
         self._deadline_s = deadline_s
         self._closing = Cancel()
 
-    def start(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> "Future[T]":
-        """Queue ``function(*args, progress=..., **kwargs)``; ``progress`` is called in a thread of this process.
+    def start(self, task: Task[T]) -> "Future[T]":
+        """Queue a task; JobFailed, JobCancelled or ExecutorLost say how else than with its result it ended."""
+        return self._threads.submit(self._supervise, task)
 
-        JobFailed, JobCancelled or ExecutorLost say how else it ended.
-        """
-        return self._threads.submit(self._supervise, function, args, kwargs, progress, cancel)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+    def shutdown(self) -> None:
         """End every task."""
         self._closing.request()
-        self._threads.shutdown(wait=wait, cancel_futures=True)
+        self._threads.shutdown(cancel_futures=True)
 
     def _raise_if_over(self, until_s: float, cancel: Cancel) -> None:
         """Raise what ends a task that is no longer wanted, or has taken too long."""
@@ -103,46 +114,28 @@ class Tasks(ABC):
             raise JobFailed(f"ended after {self._deadline_s:g} s, its deadline (TWIN_JOB_DEADLINE_S)")
 
     @abstractmethod
-    def _supervise(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> T:
+    def _supervise(self, task: Task[T]) -> T:
         """Have a task computed, and return what came of it."""
 
 
-class ProcessPerTask(Tasks, Executor):
-    """Runs ``function(*args, progress=...)`` in a fresh spawned process per task, at most ``max_workers`` at a time."""
+class ProcessPerTask(Tasks):
+    """Runs each task in a fresh spawned process, at most ``max_workers`` at a time."""
 
     def __init__(self, max_workers: int, deadline_s: float, memory_MiB: float = math.inf) -> None:
         """Tasks that run longer than ``deadline_s`` or need more than ``memory_MiB`` are ended."""
         super().__init__(max_workers, deadline_s, "job")
         self._memory_MiB = memory_MiB
 
-    def submit(self, function: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
-        """Queue a task without progress and without a way to end it early."""
-        return self.start(function, args, kwargs, lambda fraction, message: None, Cancel())
-
-    def _supervise(
-        self,
-        function: Callable[..., T],
-        args: tuple[Any, ...],
-        kwargs: dict[str, Any],
-        progress: Callable[[float, str], None],
-        cancel: Cancel,
-    ) -> T:
-        name = f"{function.__module__}:{function.__qualname__}"
+    def _supervise(self, task: Task[T]) -> T:
+        name = f"{task.function.__module__}:{task.function.__qualname__}"
         ours, theirs = _CONTEXT.Pipe()
-        process = _CONTEXT.Process(target=_run, args=(theirs, name, args, kwargs), daemon=True)
+        process = _CONTEXT.Process(target=_run, args=(theirs, name, task.args), daemon=True)
         process.start()
         theirs.close()
         until_s = time.monotonic() + self._deadline_s
         try:
             while True:
-                self._raise_if_over(until_s, cancel)
+                self._raise_if_over(until_s, task.cancel)
                 if resident_MiB(process.pid or 0) > self._memory_MiB:
                     raise JobFailed(
                         f"ended: it needed more than {self._memory_MiB:g} MiB of memory (TWIN_JOB_MEMORY_MIB); "
@@ -152,7 +145,7 @@ class ProcessPerTask(Tasks, Executor):
                     continue
                 kind, *rest = _receive(ours, process)
                 if kind == "progress":
-                    progress(*rest)
+                    task.progress(*rest)
                 elif kind == "failed":
                     raise JobFailed(*rest)
                 else:
@@ -213,7 +206,7 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+def _run(connection: Connection, name: str, args: tuple[Any, ...]) -> None:
     """Do the task: the whole life of a worker process."""
     prepare_worker()
     os.nice(NICENESS)
@@ -227,7 +220,7 @@ def _run(connection: Connection, name: str, args: tuple[Any, ...], kwargs: dict[
 
     answer: tuple[Any, ...]
     try:
-        answer = ("done", function(*args, progress=progress, **kwargs))
+        answer = ("done", function(*args, progress=progress))
     except TwinError as error:
         answer = ("failed", str(error))
     except MemoryError:

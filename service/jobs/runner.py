@@ -16,7 +16,7 @@ import numpy as np
 from service.errors import Refusal, TooLittle, TooMuch
 from service.instants import parse_instant
 from service.jobs import outcome
-from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Tasks
+from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Task, Tasks
 from service.jobs.outcome import Finished
 from service.monitoring.metrics import Metrics
 from service.store import jobs, models, selection
@@ -240,7 +240,7 @@ class Jobs:
         family = twin.specification.get("family")
         siblings = {} if family is None else await self._database.read(models.siblings, family, twin.name)
         task, function = self._task(twin, held.kind, request, telemetry, active, siblings)
-        future = self._executor.start(work, (self._workbench, function, task), {}, self._reporter(held), cancel)
+        future = self._executor.start(Task(work, (self._workbench, function, task), self._reporter(held), cancel))
         made = await asyncio.wrap_future(future)
         provenance = {
             "data_sha256": telemetry.sha256(),

@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.jobs.executor import NICENESS, ProcessPerTask
+from service.jobs.executor import NICENESS, ProcessPerTask, Task
 from tests.service.conftest import SPEC
 from tests.service.server import FAKE, Server
 
@@ -18,8 +18,9 @@ def niceness(*, progress: Callable[[float, str], None]) -> int:
 
 
 def test_a_job_has_a_low_priority() -> None:
-    with ProcessPerTask(1, 280.0) as executor:  # it may wait long for a processor: that is what low means
-        assert executor.submit(niceness).result() == min(os.nice(0) + NICENESS, 19)
+    executor = ProcessPerTask(1, 280.0)  # it may wait long for a processor: that is what low means
+    assert executor.start(Task(niceness)).result() == min(os.nice(0) + NICENESS, 19)
+    executor.shutdown()
 
 
 @pytest.mark.e2e

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from service.jobs.executor import JobFailed, ProcessPerTask
+from service.jobs.executor import JobFailed, ProcessPerTask, Task
 from service.store import retention, samples, selection
 from service.store.batch import Batch
 from service.store.database import Database
@@ -110,7 +110,7 @@ def _hoard(progress: Any) -> None:
 def test_a_job_that_needs_too_much_memory_is_ended() -> None:
     executor = ProcessPerTask(1, 600.0, 400.0)
     with pytest.raises(JobFailed, match="400 MiB of memory"):
-        executor.submit(_hoard).result()
+        executor.start(Task(_hoard)).result()
     executor.shutdown()
 
 

@@ -1,6 +1,6 @@
 """How certain the unknowns of a fit are, in the metric of the noise that the fit was made from."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -9,11 +9,14 @@ from twin_core._typing import FloatArray
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
-from twin_core.calibrate.restricted import restricted_noise, told_directions
+from twin_core.calibrate.restricted import ExpectedNoise, restricted_noise, told_directions
 from twin_core.parameters.vector import ParameterSet
 
 UNTOLD = 1e-13
 """Combinations of unknowns that readings and priors tell less than this share of the best are lost to rounding."""
+
+MOST_TURNED = 4_000_000
+"""Derivatives that are turned at once: 32 MB."""
 
 LITTLE_COST = 0.5 * 1.645**2
 """A likelihood interval of 90 % ends where the cost has risen by this."""
@@ -48,21 +51,65 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
         whitener = fit_whitener(problem, residuals)
     noise = restricted_noise(problem, optimum, whitener, residuals)
     residual = np.concatenate(residuals)
+    bends = np.abs(residual) < limit_K
     turned = told_directions(optimum.hessian, UNTOLD)  # in which nothing is lost to rounding
     hessian = turned.T @ (turned / std[:, None] ** 2)
     spread = hessian.copy()
-    for sensor, jacobian in sensor_jacobians(problem, optimum):
-        valid = whitener.valid[:, sensor]
-        rows = jacobian[valid] @ turned / problem.noise_K[sensor]
-        bends = np.abs(residual[valid, sensor]) < limit_K[sensor]
-        hessian += rows[bends].T @ rows[bends]
-        pull = noise[sensor].white_K2 * rows.T @ rows
-        for variance_K2, length_s in noise[sensor].coloured:
-            crossed = rows.T @ (0.5 * rows + _faded(whitener.time_s[valid], rows, length_s))
-            pull += variance_K2 * (crossed + crossed.T)
-        spread += pull / problem.noise_K[sensor] ** 2
+    first = np.cumsum([0, *(s.record.time_s.size for s in problem.segments)])
+    pulls = [_Pull.of(n, turned.shape[1]) for n in noise]
+    for segment, samples, block in problem.jacobian_stretches(optimum.unknowns, optimum.fit):
+        at = slice(int(first[segment]) + samples.start, int(first[segment]) + samples.stop)
+        columns = turned[np.r_[0 : problem.n_free, problem.start_columns(segment)]]
+        together = max(1, MOST_TURNED // (block.shape[0] * columns.shape[1]))
+        for begin in range(0, len(pulls), together):
+            sensors = slice(begin, min(begin + together, len(pulls)))
+            weight = (whitener.valid[at, sensors] / problem.noise_K[sensors]).T[:, :, None]
+            rows = (block[:, sensors].transpose(1, 0, 2) @ columns) * weight
+            pulled = np.array([p.along(whitener.time_s[at], r) for p, r in zip(pulls[sensors], rows, strict=True)])
+            pulled /= problem.noise_K[sensors, None, None] ** 2
+            crossed = rows.reshape(-1, rows.shape[2]).T @ pulled.reshape(-1, rows.shape[2])
+            spread += crossed + crossed.T
+            rows *= bends[at, sensors].T[:, :, None]
+            flat = rows.reshape(-1, rows.shape[2])
+            hessian += flat.T @ flat
     least_squares = np.linalg.solve(hessian, turned.T)
     return np.asarray(least_squares.T @ spread @ least_squares)
+
+
+@dataclass
+class _Pull:
+    """What the noise of one sensor makes of its derivatives along the record, which comes in stretches.
+
+    Attributes
+    ----------
+    white_K2
+        Half the variance of one reading.
+    variance_K2, length_s : (n_coloured,)
+    carried : (n_coloured, n_columns)
+        The sum of all rows so far, each faded by its age.
+    last_s
+        The last row's time.
+    """
+
+    white_K2: float
+    variance_K2: FloatArray
+    length_s: FloatArray
+    carried: FloatArray
+    last_s: float = -np.inf
+
+    @classmethod
+    def of(cls, noise: ExpectedNoise, n_columns: int) -> "_Pull":
+        """Begin a record."""
+        variance_K2, length_s = np.array(noise.coloured).reshape(-1, 2).T
+        white_K2 = 0.5 * (noise.white_K2 + float(variance_K2.sum()))
+        return cls(white_K2, variance_K2.copy(), length_s.copy(), np.zeros((length_s.size, n_columns)))
+
+    def along(self, time_s: FloatArray, rows: FloatArray) -> FloatArray:
+        """Return Y of the next rows (n_rows, n_columns) of X such that Xᵀ Σ X = Xᵀ Y + Yᵀ X; a missing reading's is zero."""
+        out = self.white_K2 * rows
+        _add_faded(time_s, rows, self.variance_K2, self.length_s, self.last_s, self.carried, out)
+        self.last_s = float(time_s[-1])
+        return out
 
 
 def is_open_ended(problem: Problem, optimum: Optimum, position: int) -> bool:
@@ -90,11 +137,22 @@ def is_open_ended(problem: Problem, optimum: Optimum, position: int) -> bool:
 
 
 @njit(cache=True)
-def _faded(time_s: FloatArray, rows: FloatArray, length_s: float) -> FloatArray:
-    """Return for every row the sum of those before it, each times exp(-age / length)."""
-    out = np.zeros_like(rows)
-    for k in range(1, time_s.size):
-        keep = np.exp((time_s[k - 1] - time_s[k]) / length_s)
-        for c in range(rows.shape[1]):
-            out[k, c] = keep * (out[k - 1, c] + rows[k - 1, c])
-    return out
+def _add_faded(
+    time_s: FloatArray,
+    rows: FloatArray,
+    variance: FloatArray,
+    length_s: FloatArray,
+    last_s: float,
+    carried: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add to every row those before it, each times variance exp(-age / length) of every coloured part."""
+    for part in range(length_s.size):
+        before_s = last_s
+        for k in range(time_s.size):
+            keep = np.exp((before_s - time_s[k]) / length_s[part])
+            for c in range(rows.shape[1]):
+                faded = keep * carried[part, c]
+                out[k, c] += variance[part] * faded
+                carried[part, c] = faded + rows[k, c]
+            before_s = time_s[k]

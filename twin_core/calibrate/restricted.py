@@ -5,7 +5,7 @@ What is left then looks whiter and smaller than what bent them. The restricted l
 that of the part of the readings which no choice of parameters can follow, so that it counts the freedom that is spent.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,11 +14,15 @@ from scipy.linalg import solve_triangular
 from twin_core._typing import FloatArray
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
-from twin_core.calibrate.residual_noise import Whitener, sensor_jacobians
+from twin_core.calibrate.residual_noise import Whitener
 from twin_core.gp.noise_model import ResidualNoise
 
-MOST_ROWS = 2000
-"""Longer records are averaged over neighbouring readings: a slow misfit is seen as well, in less time."""
+MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 2000, 100, 12_500_000
+"""Longer records are averaged over neighbouring readings: a slow misfit is seen as well, in less time. Where sensors and
+unknowns are many, so are records of which all derivatives together would be more than so many, 100 MB."""
+
+MOST_PRODUCTS = 50_000_000
+"""Products of columns, 400 MB: where those of every sensor and misfit would be more, neighbouring sensors share a misfit."""
 
 SHARES = (0.05, 0.15, 0.5, 1.5)
 SPANS = (0.03, 0.17, 1.0)
@@ -114,15 +118,31 @@ def _leftovers(
 ) -> list[Leftover]:
     """Return what a fit leaves, sensor by sensor, with neighbouring readings of long records averaged."""
     residual = np.concatenate(list(residuals))
-    segment = np.repeat(np.arange(len(problem.segments)), [s.record.time_s.size for s in problem.segments])
-    found = []
-    for sensor, jacobian in sensor_jacobians(problem, optimum):
+    lengths = [segment.record.time_s.size for segment in problem.segments]
+    segment_of, first = np.repeat(np.arange(len(lengths)), lengths), np.cumsum([0, *lengths])
+    n_sensors, n_unknowns = residual.shape[1], problem.n_unknowns
+    most_rows = int(np.clip(MOST_VALUES // (n_sensors * n_unknowns), FEWEST_ROWS, MOST_ROWS))
+    found: list[Leftover] = []
+    row_of = np.full(residual.shape, -1)  # in which row a reading counts
+    for sensor in range(n_sensors):
         valid = whitener.valid[:, sensor]
-        together = int(np.ceil(valid.sum() / MOST_ROWS))
-        seen = [np.flatnonzero((segment == s) & valid) for s in range(len(problem.segments))]
+        together = int(np.ceil(valid.sum() / most_rows))
+        seen = [np.flatnonzero((segment_of == s) & valid) for s in range(len(lengths))]
         rows = np.concatenate([own[: own.size // together * together] for own in seen]).reshape(-1, together)
-        columns = np.column_stack([jacobian, residual[:, sensor]])[rows].mean(axis=1)
+        row_of[rows, sensor] = np.arange(rows.shape[0])[:, None]
+        columns = np.zeros((rows.shape[0], n_unknowns + 1))
+        columns[:, -1] = residual[rows, sensor].mean(axis=1)
         found.append(Leftover(whitener.time_s[rows].mean(axis=1), columns, together))
+    for segment, samples, block in problem.jacobian_stretches(optimum.unknowns, optimum.fit):
+        unknowns = np.r_[0 : problem.n_free, problem.start_columns(segment)]
+        at = row_of[first[segment] + samples.start : first[segment] + samples.stop]
+        for sensor, part in enumerate(found):
+            counts = at[:, sensor] >= 0
+            if counts.any():
+                rows = at[counts, sensor]
+                begins = np.flatnonzero(np.diff(rows, prepend=-1))
+                sums = np.add.reduceat(block[counts, sensor], begins, axis=0)
+                part.columns[np.ix_(rows[begins], unknowns)] += sums / part.together
     return found
 
 
@@ -165,23 +185,30 @@ def expected_noise(
     turned = _told(left, prior, models)
     told = [replace(part, columns=part.columns @ turned) for part in left]
     options = [[model, *_misfits(model, span_s)] for model in models]
-    weighed = [[part.weigh(m) for m in own] for part, own in zip(told, options, strict=True)]
+    groups = _groups(len(left), len(options[0]) * turned.shape[1] ** 2)
+    weighed = [[_sum(told[s].weigh(options[s][k]) for s in group) for k in range(len(options[0]))] for group in groups]
     everywhere = [_sum([own[k] for own in weighed], turned.T @ prior @ turned) for k in range(len(options[0]))]
     best = int(np.argmax([restricted_log_likelihood(*total) for total in everywhere]))
     log_det, products = everywhere[best]
-    chosen = [best] * len(left)
+    chosen = [best] * len(groups)
     common = first = np.full(len(options[0]), 1.0 / len(options[0]))
-    shares = np.zeros((len(left), first.size))
+    shares = np.zeros((len(groups), first.size))
     for _ in range(SWEEPS):
-        for sensor, own in enumerate(weighed):
-            log_det, products = log_det - own[chosen[sensor]][0], products - own[chosen[sensor]][1]
+        for g, own in enumerate(weighed):
+            log_det, products = log_det - own[chosen[g]][0], products - own[chosen[g]][1]
             told_by = np.array([restricted_log_likelihood(log_det + d, products + p) for d, p in own])
-            shares[sensor] = common * np.exp(told_by - told_by.max())
-            shares[sensor] /= shares[sensor].sum()
-            chosen[sensor] = int(np.argmax(shares[sensor]))
-            log_det, products = log_det + own[chosen[sensor]][0], products + own[chosen[sensor]][1]
-        common = (first + shares.sum(axis=0)) / (1.0 + len(left))
-    return [_average(own, share) for own, share in zip(options, shares, strict=True)]
+            shares[g] = common * np.exp(told_by - told_by.max())
+            shares[g] /= shares[g].sum()
+            chosen[g] = int(np.argmax(shares[g]))
+            log_det, products = log_det + own[chosen[g]][0], products + own[chosen[g]][1]
+        common = (first + shares.sum(axis=0)) / (1.0 + len(groups))
+    return [_average(options[s], share) for group, share in zip(groups, shares, strict=True) for s in group]
+
+
+def _groups(n_sensors: int, n_products: int) -> list[list[int]]:
+    """Return which sensors share a misfit: each has its own unless ``n_products`` of each would be too many."""
+    n_groups = int(np.clip(MOST_PRODUCTS // n_products, 1, n_sensors))
+    return [group.tolist() for group in np.array_split(np.arange(n_sensors), n_groups)]
 
 
 def _misfits(model: ResidualNoise, span_s: float) -> list[ResidualNoise]:
@@ -190,8 +217,12 @@ def _misfits(model: ResidualNoise, span_s: float) -> list[ResidualNoise]:
     return [replace(model, sigma_ou=share * size, length_s=span * span_s) for span in SPANS for share in SHARES]
 
 
-def _sum(parts: Sequence[tuple[float, FloatArray]], prior: FloatArray) -> tuple[float, FloatArray]:
-    return sum((d for d, _ in parts), 0.0), sum((p for _, p in parts), prior)
+def _sum(parts: Iterable[tuple[float, FloatArray]], prior: FloatArray | float = 0.0) -> tuple[float, FloatArray]:
+    """Return the sums of log-determinants and of products, those of the priors added."""
+    log_det, products = 0.0, prior
+    for d, p in parts:
+        log_det, products = log_det + d, products + p
+    return log_det, np.asarray(products)
 
 
 def _average(options: Sequence[ResidualNoise], shares: FloatArray) -> ExpectedNoise:
@@ -209,7 +240,7 @@ def _told(left: Sequence[Leftover], prior: FloatArray, models: Sequence[Residual
     white = [
         replace(model, sigma_ou=0.0, sigma_white=float(np.hypot(model.sigma_ou, model.sigma_white))) for model in models
     ]
-    _, products = _sum([part.weigh(model) for part, model in zip(left, white, strict=True)], prior)
+    _, products = _sum((part.weigh(model) for part, model in zip(left, white, strict=True)), prior)
     directions = told_directions(products[:-1, :-1], UNTOLD)
     turned = np.zeros((directions.shape[0] + 1, directions.shape[1] + 1))
     turned[:-1, :-1], turned[-1, -1] = directions, 1.0

@@ -1,7 +1,7 @@
 """Whether what a specification names is declared, and declared once: every reference that is broken, in words."""
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from twin_core.network.formula import channels_of
 from twin_core.network.orbit_block import PREFIX
@@ -46,6 +46,45 @@ def broken_references(spec: "TwinSpec") -> Iterable[str]:
     for sensor in spec.criteria.per_sensor:
         if sensor not in seen:
             yield f"criteria.per_sensor.{sensor}: reads no node (sensors: {', '.join(seen) or 'none'})"
+
+
+def unknown_names(data: Mapping[str, Any]) -> Iterable[str]:
+    """Yield names that data declare nowhere, where other faults keep them from being a specification.
+
+    What has not the form that it should have is passed over: those faults are told already.
+    """
+
+    def entries(field: str) -> Iterable[tuple[int, Mapping[str, Any]]]:
+        listed = data.get(field)
+        return (
+            (i, entry)
+            for i, entry in enumerate(listed if isinstance(listed, list) else ())
+            if isinstance(entry, Mapping)
+        )
+
+    def keys(field: str) -> list[str]:
+        declared = data.get(field)
+        return [str(name) for name in declared] if isinstance(declared, Mapping) else []
+
+    nodes = [str(entry.get("id")) for _, entry in entries("nodes")]
+    ends, channels = [*nodes, *keys("boundaries")], [*keys("channels"), *keys("derived")]
+    for field in ("conductors", "radiation"):
+        for i, entry in entries(field):
+            pair = entry.get("between")
+            for end in pair if isinstance(pair, list) else ():
+                yield from _end(f"{field}[{i}].between", str(end), ends, "node or boundary")
+    for field in ("radiators", "loads", "heaters"):
+        for i, entry in entries(field):
+            if "node" in entry:
+                yield from _end(f"{field}[{i}].node", str(entry["node"]), nodes)
+            if field == "radiators" and "sink" in entry:
+                yield from _end(f"{field}[{i}].sink", str(entry["sink"]), keys("boundaries"), "boundary")
+            if field == "loads" and "channel" in entry and not str(entry["channel"]).startswith(PREFIX):
+                yield from _end(f"{field}[{i}].channel", str(entry["channel"]), channels, "channel")
+    for i, entry in entries("nodes"):
+        read = entry.get("sensor")
+        for name in read if isinstance(read, list) else [] if read is None else [read]:
+            yield from _end(f"nodes[{i}].sensor", str(name), channels, "channel")
 
 
 def _unseen(spec: "TwinSpec") -> Iterable[str]:

@@ -1,7 +1,7 @@
 """Specifications as files and plain data, with one clear message for what is wrong."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from twin_core.errors import SpecError
 from twin_core.network.quantities import NAME, TWIN_ID
+from twin_core.network.references import unknown_names
 from twin_core.network.spec import REFERENCES, TwinSpec
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -185,7 +186,10 @@ def parse_mapping(text: str, name: str, *, is_json: bool = False, may_repeat: bo
 
 
 def read_model(
-    source: Path | str | dict[str, Any], kind: type[Model], in_words: Callable[[ValidationError], Sequence[str]]
+    source: Path | str | dict[str, Any],
+    kind: type[Model],
+    in_words: Callable[[ValidationError], Sequence[str]],
+    beside: Callable[[dict[str, Any]], Iterable[str]] = lambda _: (),
 ) -> Model:
     """Return what a YAML or JSON file, or its parsed mapping, describes.
 
@@ -197,6 +201,8 @@ def read_model(
         What it should describe.
     in_words
         Says in one line each which fields are wrong, and how.
+    beside
+        What else is wrong with a mapping some of whose fields are wrong.
 
     Raises
     ------
@@ -208,7 +214,8 @@ def read_model(
     try:
         return kind.model_validate(data)
     except ValidationError as error:
-        problems = in_words(error)
+        told = any(item["type"] == REFERENCES for item in error.errors())  # every field is right: names were looked up
+        problems = list(dict.fromkeys([*in_words(error), *(() if told else beside(data))]))
         raise SpecError(prefix + problems[0], problems) from error
     except SpecError as error:
         raise SpecError(prefix + str(error), error.problems) from error
@@ -216,7 +223,7 @@ def read_model(
 
 def load_spec(source: Path | str | dict[str, Any]) -> TwinSpec:
     """Return the validated specification from a YAML or JSON file, or from its parsed mapping; SpecError as above."""
-    return read_model(source, TwinSpec, _in_words)
+    return read_model(source, TwinSpec, _in_words, unknown_names)
 
 
 def dump_spec(spec: TwinSpec) -> dict[str, Any]:

@@ -1,58 +1,87 @@
 """The derivatives of ``derivatives`` for networks of many nodes: the same formulas, carried out by BLAS and LAPACK.
 
-The compiled loops are the quicker ones below some dozens of nodes; beyond, products and factors of full matrices decide.
+The compiled loops are the quicker ones below some dozens of nodes; beyond, products and factors of full matrices decide. What
+a step adds to the columns of parameters is gathered in the modes of A, and brought to the nodes by the product that solves for
+the end of the step as well.
 """
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
-from scipy.sparse import csr_array
+from numba import njit
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.simulate.modes import Modes, divided_differences, weights
+from twin_core.simulate.splitting import Turning
 
 MANY = 48
 """Nodes from which on this way is the quicker one."""
 
-
-SPARSE = 0.15
-"""Up to this share of n entries per column that changes A they are taken one by one: gathering costs several times a product."""
-
-
-class _Pattern:
-    """Where a sparse matrix has its entries; several at one place add up."""
-
-    def __init__(self, row: IntArray, column: IntArray, shape: tuple[int, int]) -> None:
-        cells, self._place = np.unique(row * shape[1] + column, return_inverse=True)
-        self._indices, self._shape = cells % shape[1], shape
-        self._pointers = np.searchsorted(cells, np.arange(shape[0] + 1) * shape[1])
-
-    def filled(self, entries: FloatArray) -> csr_array:
-        """Return the matrix with these values."""
-        values = np.bincount(self._place, weights=entries, minlength=self._indices.size)
-        return csr_array((values, self._indices, self._pointers), shape=self._shape)
+SPARSE = 1.0
+"""Up to this share of n entries per column that changes A they are taken one by one: beyond, a product of full matrices is
+quicker."""
 
 
-class _Turning:
-    """How columns change A, (n_turned, n, n), multiplied with what differs from step to step."""
+@njit(cache=True, nogil=True)
+def _add_entries(row: IntArray, column: IntArray, entry: FloatArray, weight: FloatArray, out: FloatArray) -> None:
+    """Add weight @ (the matrix with these entries) to ``out``, both transposed."""
+    for e in range(row.size):
+        for i in range(out.shape[1]):
+            out[column[e], i] += weight[row[e], i] * entry[e]
 
-    def __init__(self, modes: Modes, turning: FloatArray) -> None:
-        self._dense: FloatArray | None = None
-        which, row, self._column = np.nonzero(turning)
-        each = np.bincount(which, minlength=turning.shape[0])
-        if not each.all() or which.size > SPARSE * turning.shape[0] * turning.shape[1]:
-            in_modes = modes.inward @ turning @ modes.outward
+
+@njit(cache=True, nogil=True)
+def _gather(
+    entry_column: IntArray,
+    entry_node: IntArray,
+    entry_series: FloatArray,
+    k: int,
+    early: FloatArray,
+    late: FloatArray,
+    inward: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add what rates that depend on columns do over step k, in modes; ``inward`` and ``out`` are transposed."""
+    for e in range(entry_column.size):
+        first, last = entry_series[e, k, 0], entry_series[e, k, 1]
+        if first != 0.0 or last != 0.0:
+            for i in range(early.size):
+                out[entry_column[e], i] += inward[entry_node[e], i] * (early[i] * first + late[i] * last)
+
+
+@njit(cache=True, nogil=True)
+def _turn(
+    turned: IntArray,
+    row: IntArray,
+    column: IntArray,
+    value: FloatArray,
+    inward: FloatArray,
+    through: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add sum_j (inward dA outward)[i, j] mixed[i, j] of the entries of every dA; all matrices are transposed."""
+    for e in range(turned.size):
+        for i in range(inward.shape[1]):
+            out[turned[e], i] += value[e] * inward[row[e], i] * through[column[e], i]
+
+
+class _Turned:
+    """How columns change A, multiplied with what differs from step to step."""
+
+    def __init__(self, modes: Modes, turns: Turning) -> None:
+        self._turns, self._outward, self._dense = turns, modes.outward, None
+        n = modes.rate_per_s.size
+        if turns.row.size > SPARSE * turns.columns.size * n:
+            in_modes = modes.inward @ turns.dense(n) @ modes.outward
             self._dense = np.ascontiguousarray(in_modes.transpose(1, 0, 2))  # (n, n_turned, n)
-            return
-        self._outward = modes.outward.T
-        self._inward = modes.inward[:, row] * turning[which, row, self._column]
-        self._first = np.cumsum(each) - each
+        self._columns = turns.columns[turns.which]
 
-    def times(self, mixed: FloatArray) -> FloatArray:
-        """Return sum_j (inward dA outward)[t, i, j] mixed[i, j], (n, n_turned)."""
+    def add(self, mixed: FloatArray, inward: FloatArray, out: FloatArray) -> None:
+        """Add sum_j (inward dA outward)[i, j] mixed[i, j] of every column to (n_columns, n); ``inward`` is transposed."""
+        turns = self._turns
         if self._dense is not None:
-            return np.asarray((self._dense @ mixed[:, :, None])[:, :, 0])
-        through = mixed @ self._outward
-        return np.add.reduceat(self._inward * through[:, self._column], self._first, axis=1)
+            out[turns.columns] += (self._dense @ mixed[:, :, None])[:, :, 0].T
+        else:
+            through = self._outward @ mixed.T
+            _turn(self._columns, turns.row, turns.column, turns.value_W_per_K, inward, through, out)
 
 
 def march_sensitivities_of_many(
@@ -63,8 +92,7 @@ def march_sensitivities_of_many(
     entry: FloatArray,
     stages: FloatArray,
     rate: FloatArray,
-    turned: IntArray,
-    turning: FloatArray,
+    turns: Turning,
     entry_column: IntArray,
     entry_node: IntArray,
     entry_series: FloatArray,
@@ -74,8 +102,8 @@ def march_sensitivities_of_many(
 ) -> tuple[FloatArray, FloatArray]:
     """Advance d state / d column along a trajectory without relays.
 
-    Arguments and result as of ``march_sensitivities``, but ``turning`` is (n_turned, n, n) dA between nodes: a coupling changes
-    four of its entries, which are taken one by one where they are few.
+    Arguments and result as of ``march_sensitivities``, but ``turns`` is dA between nodes: a coupling changes four of its entries,
+    which are taken one by one where they are few.
     """
     n_steps, (n, n_columns) = step_s.size, start.shape
     out = np.empty((sample_step.size, observed.size, n_columns))
@@ -86,30 +114,33 @@ def march_sensitivities_of_many(
     samples = {int(k): np.flatnonzero(sample_step == k) for k in np.unique(sample_step)}
     mode, pushed = stages @ modes.inward.T, rate @ modes.inward.T
     pushed -= modes.rate_per_s * mode
-    fed, among = np.unique(entry_column, return_inverse=True)  # the columns of parameters; most may be initial states
-    rest = _Pattern(row, column, (n, n))
-    given = _Pattern(entry_node, among, (n, fed.size))
-    turn = _Turning(modes, turning)
+    moved = 1 + max(
+        int(turns.columns.max(initial=-1)), int(entry_column.max(initial=-1))
+    )  # columns of parameters come first
+    turned = _Turned(modes, turns)
+    inward, outward = (np.ascontiguousarray(matrix.T) for matrix in (modes.inward, modes.outward))
+    given, identity = np.empty((moved, n)), np.eye(n)
     for k in range(n_steps):
         if step_s[k] != at_s:
             at_s = float(step_s[k])
             weights(at_s, modes.rate_per_s, keep, whole, late)
             early = whole - late
-            dense_keep, dense_early, dense_late = (
-                (modes.outward * weight) @ modes.inward for weight in (keep, early, late)
-            )
-            if turned.size > 0:
+            turned_keep, turned_early, turned_late = ((inward * weight) @ outward for weight in (keep, early, late))
+            if turns.columns.size > 0:
                 divided_differences(at_s, modes.rate_per_s, keep, early, late, divided)
-        first, last = (rest.filled(entry[k, side]) for side in (0, 1))
-        work = (dense_keep + (first.T @ dense_early.T).T) @ state
-        for side, dense in enumerate((dense_early, dense_late) if fed.size else ()):
-            work[:, fed] += (given.filled(entry_series[:, k, side]).T @ dense.T).T
-        if turned.size > 0:
+        forward, backward = turned_keep.copy(), identity.copy()
+        _add_entries(row, column, entry[k, 0], turned_early, forward)
+        _add_entries(row, column, -entry[k, 1], turned_late, backward)
+        # Close to the identity, so that its inverse is as good as its factors, and the quicker way to products.
+        solved = np.concatenate([forward, outward]) @ np.linalg.inv(backward)
+        given[:] = 0.0
+        _gather(entry_column, entry_node, entry_series, k, early, late, inward, given)
+        if turns.columns.size > 0:
             mixed = divided[0] * mode[k, 0] + divided[1] * pushed[k, 0] + divided[2] * pushed[k, 1]
             mixed -= early[:, None] * mode[k, 0] + late[:, None] * mode[k, 1]
-            work[:, turned] += modes.outward @ turn.times(mixed)
-        backward = np.eye(n) - (last.T @ dense_late.T).T
-        state = lu_solve(lu_factor(backward, overwrite_a=True, check_finite=False), work, check_finite=False)
+            turned.add(mixed, inward, given)
+        state = solved[:n].T @ state
+        state[:, :moved] += solved[n:].T @ given.T
         if k + 1 in samples:
             out[samples[k + 1]] = state[observed]
     return out, state

@@ -21,7 +21,17 @@ from twin_core.simulate.modes import Modes
 from twin_core.simulate.one_step import take_steps
 from twin_core.simulate.relays import N_KICK, NO_RELAYS, Relays
 from twin_core.simulate.rollout import Rollout
-from twin_core.simulate.splitting import Split, anchors, less_modes, modes_of, pieces, symmetric, turning
+from twin_core.simulate.splitting import (
+    NO_TURNING,
+    Split,
+    Turning,
+    anchors,
+    less_modes,
+    modes_of,
+    pieces,
+    symmetric,
+    turning,
+)
 from twin_core.simulate.stages import balance_along
 
 MOST_VALUES, LEAST_STEPS = 16_000_000, 64
@@ -60,7 +70,7 @@ def sensitivities(
     begin_K = trajectory.start_K
     if forcing.n_steps == 0:
         yield slice(0, forcing.sample_step.size), np.repeat(start_columns[None, observed], forcing.sample_step.size, 0)
-    about_K, turned, turns = None, np.zeros(0, dtype=np.int64), np.zeros((0, own.size, own.size))
+    about_K, turns = None, NO_TURNING
     most = max(LEAST_STEPS, MOST_VALUES // max(observed.size * state.shape[1], 1))
     for first, last, anchor in pieces(anchors(trajectory.stages_K[:, 0]), most):
         low = int(np.searchsorted(forcing.sample_step, first, side="left" if first == 0 else "right"))
@@ -70,8 +80,7 @@ def sensitivities(
         modes = switched.split.modes
         if anchor is not about_K:
             about_K = anchor
-            turned, turns = turning(network, values, forcing, about_K, switched.split.parts)
-            turns = turns / own[:, None]
+            turns = turning(network, values, forcing, about_K, switched.split.parts).per(own)
         balance = balance_along(
             network,
             values,
@@ -92,7 +101,6 @@ def sensitivities(
         split = _Split(
             modes,
             switched.split.slope_W_per_K,
-            turned,
             turns,
             stages,
             switched.split.relays,
@@ -107,12 +115,11 @@ def sensitivities(
 
 @dataclass(frozen=True)
 class _Split:
-    """A as it was in the rollout: its modes, C A, and which columns change it by how much, (n_turned, n, n)."""
+    """A as it was in the rollout: its modes, C A, and how columns change A."""
 
     modes: Modes
     slope_W_per_K: FloatArray
-    turned: IntArray
-    turns: FloatArray
+    turns: Turning
     stages: FloatArray
     relays: Relays
     kicks: FloatArray
@@ -220,12 +227,10 @@ def heat_response(
     # No column changes a coupling, so that any A close by will do: that of the mean.
     mean = balance.jacobian.mean() * balance.own_J_per_K[:, None]
     slope = symmetric(mean)
-    nothing = np.zeros(0, dtype=np.int64)
     split = _Split(
         modes_of(slope, balance.own_J_per_K),
         slope,
-        nothing,
-        np.zeros((0, n_nodes, n_nodes)),
+        NO_TURNING,
         np.zeros((forcing.n_steps, 2, n_nodes)),
         NO_RELAYS,
         np.zeros((forcing.n_steps, 0, N_KICK)),
@@ -260,10 +265,10 @@ def _march(
     switched = (split.relays, split.kicks, split.relay_column, split.relay_slope)
     rest = (column, node, series.reshape(column.size, step_s.size, 2), state, sample_step, observed)
     if state.shape[0] >= MANY and split.relays.node.size == 0:
-        block, end = march_sensitivities_of_many(*along, split.turned, split.turns, *rest)
+        block, end = march_sensitivities_of_many(*along, split.turns, *rest)
     else:
-        in_modes = split.modes.inward @ split.turns @ split.modes.outward
-        block, end = march_sensitivities(*along, *switched, split.turned, in_modes, *rest)
+        in_modes = split.modes.inward @ split.turns.dense(state.shape[0]) @ split.modes.outward
+        block, end = march_sensitivities(*along, *switched, split.turns.columns, in_modes, *rest)
     if balance.moves:
         slope = np.concatenate([begin_slope, balance.slope[1::2]])
         block *= slope[sample_step][:, observed, None]

@@ -318,15 +318,52 @@ def limits(network: Network, values: FloatArray, limit_K: tuple[float, float]) -
     return lowest, highest
 
 
-def turning(
-    network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray, split: Couplings
-) -> tuple[IntArray, FloatArray]:
-    """Return which free parameters change A, (n_turned,), and C dA / d free parameter, (n_turned, n_nodes, n_nodes)."""
+@dataclass(frozen=True)
+class Turning:
+    """How free parameters change C A.
+
+    Attributes
+    ----------
+    columns : (n_turned,)
+        Positions of these parameters among the free ones.
+    which, row, column : (n_entries,)
+        Position in ``columns``, and place in the matrix; entries at one place add up.
+    value_W_per_K : (n_entries,)
+        C dA / d free parameter.
+    """
+
+    columns: IntArray
+    which: IntArray
+    row: IntArray
+    column: IntArray
+    value_W_per_K: FloatArray
+
+    def dense(self, n_nodes: int) -> FloatArray:
+        """Return the matrices, (n_turned, n_nodes, n_nodes)."""
+        out = np.zeros((self.columns.size, n_nodes, n_nodes))
+        np.add.at(out, (self.which, self.row, self.column), self.value_W_per_K)
+        return out
+
+    def per(self, capacity_J_per_K: FloatArray) -> "Turning":
+        """Return dA / d free parameter instead, the capacities being (n_nodes,)."""
+        return replace(self, value_W_per_K=self.value_W_per_K / capacity_J_per_K[self.row])
+
+
+_NOTHING = np.zeros(0, dtype=np.int64)
+NO_TURNING = Turning(_NOTHING, _NOTHING, _NOTHING, _NOTHING, np.zeros(0))
+
+_Entries = tuple[IntArray, IntArray, IntArray, FloatArray]
+"""Parameter, row, column and value of entries, (n_entries,) each."""
+
+
+def turning(network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray, split: Couplings) -> Turning:
+    """Return how the free parameters change C A about some temperatures."""
     parameters, own = network.parameters, values[network.capacity_index]
     slope = split.slope_W_per_K(about_K)
     position = {int(index): k for k, index in enumerate(parameters.free_index)}
     along = probe(network, values, forcing, about_K)
-    found: dict[int, FloatArray] = {}
+    found: list[_Entries] = []
+    pairs: list[tuple[int, int, int, float, float]] = []
     for number, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
         if number in split.others or any(number == position for position, _ in split.relays):
             continue
@@ -334,30 +371,55 @@ def turning(
             shared, size = parameters.ties.get(parameter, (parameter, 1.0))
             if shared not in position or isinstance(term, ChannelLoad | TableLoad):
                 continue
-            change = found.setdefault(shared, np.zeros_like(slope))
             if isinstance(term, Conductors | NodeRadiation):  # by far the most, and told by their pairs
-                a, b = term.pairs[item]
-                unit = np.ones(2)
-                if isinstance(term, NodeRadiation):
-                    unit = 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * about_K[[a, b]] ** 3
-                change[[a, a, b, b], [a, b, a, b]] += size * np.array([-unit[0], unit[1], unit[0], -unit[1]])
+                pairs.append((shared, *term.pairs[item], size, float(isinstance(term, NodeRadiation))))
                 continue
             step = DIFFERENCE * max(abs(float(values[parameter])), 1e-6)
-            for sign in (1.0, -1.0):
-                moved = values[index].copy()
-                moved[item] += sign * step
-                part = term.evaluate(along, moved)
-                block = np.ix_(part.nodes, part.nodes)
-                change[block] += size * sign / (2.0 * step) * part.d_temperature[0]
-    found = {shared: symmetric(change, slope) for shared, change in found.items() if change.any()}
+            moved = [values[index].copy() for _ in range(2)]
+            moved[0][item] -= step
+            moved[1][item] += step
+            low, high = (term.evaluate(along, near) for near in moved)
+            block = size / (2.0 * step) * (high.d_temperature[0] - low.d_temperature[0])
+            nodes = np.array(low.nodes, dtype=np.int64)
+            row, column = (nodes[at] for at in np.indices(block.shape).reshape(2, -1))
+            block = symmetric(block, slope[np.ix_(nodes, nodes)])
+            found.append((np.full(row.size, shared), row, column, block.ravel()))
+    if pairs:
+        found.append(_of_pairs(slope, about_K, *np.array(pairs).T))
     mine = symmetric(slope)
     for node, parameter in enumerate(network.capacity_index.tolist()):
         shared, size = parameters.ties.get(parameter, (parameter, 1.0))
-        if shared in position and mine[node].any():
-            change = np.zeros_like(slope)
-            change[node] = -size * mine[node] / own[node]
-            found[shared] = found.get(shared, 0.0) + change
-    turned = np.array([position[p] for p in found], dtype=np.int64)
-    slopes = [parameters.slope(p, float(values[p])) for p in found]
-    n = own.size
-    return turned, np.array([s * change for s, change in zip(slopes, found.values(), strict=True)]).reshape(-1, n, n)
+        if shared in position:
+            near = np.flatnonzero(mine[node])
+            value = -size * mine[node, near] / own[node]
+            found.append((np.full(near.size, shared), np.full(near.size, node), near, value))
+    if not found:
+        return NO_TURNING
+    parameter, row, column, value = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    kept = value != 0.0
+    changed, which = np.unique(parameter[kept], return_inverse=True)
+    slopes = np.array([parameters.slope(int(p), float(values[p])) for p in changed])
+    columns = np.array([position[int(p)] for p in changed], dtype=np.int64)
+    return Turning(columns, which, row[kept], column[kept], slopes[which] * value[kept])
+
+
+def _of_pairs(
+    slope_W_per_K: FloatArray,
+    about_K: FloatArray,
+    parameter: FloatArray,
+    first: FloatArray,
+    second: FloatArray,
+    size: FloatArray,
+    radiates: FloatArray,
+) -> _Entries:
+    """Return the entries of couplings between two nodes, as symmetric as the coupling is taken to be (``symmetric``)."""
+    a, b = first.astype(np.int64), second.astype(np.int64)
+    by_a, by_b = (
+        size * np.where(radiates > 0.0, 4.0 * STEFAN_BOLTZMANN_W_PER_M2_K4 * about_K[node] ** 3, 1.0) for node in (a, b)
+    )
+    there, back = slope_W_per_K[a, b], slope_W_per_K[b, a]
+    mutual = np.where(np.abs(there) < np.abs(back), by_b, by_a)
+    mutual = np.where(np.abs(there) == np.abs(back), 0.5 * (by_a + by_b), mutual)
+    mutual[~((there * back > 0.0) | ((there == back) & (by_a == by_b)))] = 0.0
+    row, column = np.concatenate([a, a, b, b]), np.concatenate([a, b, a, b])
+    return np.tile(parameter.astype(np.int64), 4), row, column, np.concatenate([-by_a, mutual, mutual, -by_b])

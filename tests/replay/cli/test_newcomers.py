@@ -54,7 +54,8 @@ def test_all_faults_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     path.write_text(
         "twin: x\nchannels: {T: {kind: temperature, unit: F}}\n"
         "nodes: [{id: a, sensor: T, capacity_J_per_K: 500}, {id: b, capacity_J_per_K: {gues: 3}}]\n"
-        "conductors: [{between: [a, a], conductance_W_per_K: 0.5}]\n"
+        "conductors: [{between: [a, a], conductance_W_per_K: 0.5}, {between: [a, c]}]\n"
+        "loads: [{channel: Q, node: d}]\n"
     )
     assert main(["check", str(path)]) == 1
     lines = capsys.readouterr().out.splitlines()
@@ -64,8 +65,16 @@ def test_all_faults_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         "unit of a temperature channel is K or degC",
         ".gues: unknown field",
         "joins 'a' to itself",
+        "conductors[1].between: unknown node or boundary 'c' (known: a, b)",
+        "loads[0].node: unknown node 'd'",
+        "loads[0].channel: unknown channel 'Q' (known: T)",
     ):
         assert sum(said in line for line in lines) == 1, (said, lines)
+    path.write_text(
+        "twin: x\nchannels: {T: {kind: temperature, unit: K}}\nnodes: [{id: a, sensor: U}, {id: b, sensor: T}]\n"
+    )
+    assert main(["check", str(path)]) == 1
+    assert capsys.readouterr().out.count("unknown channel 'U'") == 1
     assert main(["check", str(path), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["valid"] is False
     assert main(["check", str(tmp_path / "none.yaml")]) == 2

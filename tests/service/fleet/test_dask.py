@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from service.jobs.dask import DaskTasks
-from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed
+from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Task
 from twin_core.errors import ModelError
 
 pytestmark = [pytest.mark.fleet, pytest.mark.filterwarnings("ignore")]
@@ -74,12 +74,12 @@ def cluster() -> Iterator[Cluster]:
 def test_results_refusals_and_progress_come_back(cluster: Cluster) -> None:
     tasks = DaskTasks(cluster.address, 2, 60.0)
     heard: list[str] = []
-    done = tasks.start(answer, (21.0,), {}, lambda fraction, message: heard.append(message), Cancel())
+    done = tasks.start(Task(answer, (21.0,), lambda fraction, message: heard.append(message)))
     assert done.result(60) == 42.0 and heard == ["half"]
     with pytest.raises(JobFailed, match="no solution"):
-        tasks.start(refuse, (), {}, lambda fraction, message: None, Cancel()).result(60)
+        tasks.start(Task(refuse)).result(60)
     cancel = Cancel()
-    late = tasks.start(dawdle, (), {}, lambda fraction, message: None, cancel)
+    late = tasks.start(Task(dawdle, cancel=cancel))
     cancel.request()
     with pytest.raises(JobCancelled):
         late.result(30)
@@ -88,13 +88,13 @@ def test_results_refusals_and_progress_come_back(cluster: Cluster) -> None:
 
 def test_a_task_survives_its_worker_and_is_given_back_with_its_scheduler(cluster: Cluster) -> None:
     tasks = DaskTasks(cluster.address, 2, 120.0)
-    slow = tasks.start(dawdle, (), {}, lambda fraction, message: None, Cancel())
+    slow = tasks.start(Task(dawdle))
     time.sleep(5)
     first = cluster.worker
     cluster.worker = cluster.add_worker()
     cluster.kill(first)
     assert slow.result(90) != first.pid
-    lost = tasks.start(dawdle, (), {}, lambda fraction, message: None, Cancel())
+    lost = tasks.start(Task(dawdle))
     time.sleep(3)
     cluster.kill(cluster.scheduler)
     with pytest.raises(ExecutorLost):

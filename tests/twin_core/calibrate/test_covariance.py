@@ -16,6 +16,7 @@ from twin_core.calibrate.second_order import Calibration, fit_trajectories, prep
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
+from twin_core.simulate import response
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -55,6 +56,30 @@ def test_it_is_that_of_least_squares_under_the_noise(monkeypatch: pytest.MonkeyP
         spread += weight[sensor] ** 2 * rows.T @ full @ rows
     oracle = np.linalg.solve(hessian, np.linalg.solve(hessian, spread).T)
     np.testing.assert_allclose(trajectory_covariance(problem, done.optimum, done.whitener), oracle, rtol=1e-6)
+
+
+def test_records_may_come_in_stretches_and_sensors_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The covariance is the same, over two segments of which one lacks readings, as if all derivatives were held at once."""
+    first, second = telemetry(0, 0.05), telemetry(1, 0.05, n_times=150)
+    first.values["T_b"][40:60] = np.nan
+    done = fit_trajectories(load_spec(declared()), [first, second])
+    arguments = (done.problem, done.optimum, done.whitener)
+    once = trajectory_covariance(*arguments)
+    monkeypatch.setattr(response, "MOST_VALUES", 1)
+    monkeypatch.setattr(response, "LEAST_STEPS", 7)
+    monkeypatch.setattr(covariance, "MOST_TURNED", 1)
+    std = np.sqrt(np.diag(once))
+    np.testing.assert_allclose((trajectory_covariance(*arguments) - once) / np.outer(std, std), 0.0, atol=1e-9)
+
+
+def test_averages_over_neighbours_tell_the_noise_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where derivatives are many, rows stand for several readings: the bands hardly move."""
+    done = fitted(telemetry(2, 0.05, n_times=600))
+    arguments = (done.problem, done.optimum, done.whitener)
+    once = np.sqrt(np.diag(trajectory_covariance(*arguments)))
+    monkeypatch.setattr(restricted, "MOST_VALUES", 1)
+    averaged = np.sqrt(np.diag(trajectory_covariance(*arguments)))
+    assert 0.7 < (averaged / once).min() and (averaged / once).max() < 1.4
 
 
 def test_under_white_noise_no_estimate_is_more_certain() -> None:
