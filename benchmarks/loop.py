@@ -30,7 +30,6 @@ from twin_core.holdout import predict, split_fraction
 
 HOLDOUT = 0.3
 RESULTS = Path("build/loop.jsonl")
-DEFAULT_GROUPS = ("network", "fem", "clean", "outside")
 
 
 def place(row: dict[str, Any]) -> tuple[str, frozenset[Any]]:
@@ -46,6 +45,7 @@ def run(task: Task) -> dict[str, Any]:
     report = close_loop(case.spec, [case.record], holdout=HOLDOUT).report
     seconds = time.perf_counter() - begun
     truth = None if case.effect is None else place({"effect": case.effect, "where": case.where})
+    truths = {place({"effect": hidden.effect, "where": hidden.where}) for hidden in case.truths}
     findings = report["findings"]
     named = [place(row) for row in findings]
     listed = named + [place(other) for row in findings for other in row["alternatives"]]
@@ -62,6 +62,9 @@ def run(task: Task) -> dict[str, Any]:
         "verdict": report["verdict"],
         "first": bool(named) and named[0] == truth,
         "listed": truth in listed,
+        "n_hidden": len(truths),
+        "n_right": len(truths & set(named)),
+        "n_wrong": len(set(named) - truths),
         "findings": [
             {key: row[key] for key in ("effect", "where", "parameters", "evidence", "alternatives")} for row in findings
         ],
@@ -155,7 +158,7 @@ def _values(where: dict[str, Any]) -> str:
 def main() -> None:
     """Run the benchmark from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--groups", nargs="+", default=list(DEFAULT_GROUPS), choices=GROUPS)
+    parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--networks", type=int, default=N_NETWORKS, help="networks per effect")
     parser.add_argument("--clean", type=int, default=N_CLEAN, help="clean records")
     parser.add_argument("--effects", nargs="+", help="only these effects")

@@ -9,7 +9,16 @@ from scipy.stats import norm
 from benchmarks.bands import Z90, Row, bands
 from benchmarks.markdown import TABLES
 
-COLOURS = {"network": "tab:blue", "fem": "tab:orange", "clean": "tab:green", "outside": "tab:red"}
+COLOURS = {
+    "network": "tab:blue",
+    "fem": "tab:orange",
+    "fem2": "tab:brown",
+    "two": "tab:purple",
+    "three": "tab:pink",
+    "clean": "tab:green",
+    "clean_fem2": "tab:olive",
+    "outside": "tab:red",
+}
 
 
 def save_plot(rows: Sequence[Row], name: str) -> str:
@@ -28,7 +37,9 @@ def save_plot(rows: Sequence[Row], name: str) -> str:
     errors.loglog([low, high], [low, high], "k:", linewidth=0.8)
     errors.set(xlabel="held-out error before, of the noise", ylabel="after")
     seconds.set(xlabel="seconds of a case", ylabel="share of the cases")
-    z = [band.z for row in rows if row["group"] in ("network", "fem") for band in bands(row["truth"], row["own"])]
+    z = [
+        band.z for row in rows if row["group"] in ("network", "fem", "fem2") for band in bands(row["truth"], row["own"])
+    ]
     at = np.linspace(-5.0, 5.0, 201)
     spread.hist(np.clip(z, -5.0, 5.0), bins=np.linspace(-5.0, 5.0, 41), density=True, color="tab:blue", alpha=0.5)
     spread.plot(at, norm.pdf(at), "k", linewidth=0.8)

@@ -11,6 +11,7 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
+from twin_core.discover.coarseness import stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.discover.wald import least_wald_score, score_needed
@@ -29,6 +30,7 @@ SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters 
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
+OUTDONE = "another effect in its place explains the readings better"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
 SMALL_REMAINDER = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
@@ -151,31 +153,39 @@ def threshold(false_alarm_rate: float) -> float:
 
 
 def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
-    """Keep the best option that passes evidence and validation; False if none does."""
+    """Keep the best option that passes evidence and validation; False if none does.
+
+    A name that would be withdrawn, for it explains too little beside what stays, is kept only where no other one passes.
+    """
     judged = simplest_first(once_each(options))
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
     weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
+    most = N_VALIDATED_FREE if is_free else N_VALIDATED
     refused: list[Judged] = []
-    for best in judged[: N_VALIDATED_FREE if is_free else N_VALIDATED]:
-        if best.evidence.log_bayes_factor <= needed:
+    passed: list[Judged] = []
+    for best in judged:
+        n_validated = sum(j.validation is not None for j in refused) + len(passed)
+        if best.evidence.log_bayes_factor <= needed or n_validated >= most:
             continue
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
-        refused.append(own)
-        if resembles:
-            break  # what explains less is no better a name for this heat
-        if own.validation is not None and not own.reason:
-            refused.pop()
-            elsewhere = [
-                j for j in judged if _places(j) != _places(best) and all(j.effects != r.effects for r in refused)
-            ]
-            close = tuple(j for j in elsewhere if is_close(j, best))
-            state.findings.append(Finding(own, close))
-            state.trial = best.trial
-            state.rejected += refused
-            return True
-    state.rejected += [*refused, *weak]
-    return False
+        if own.reason:
+            refused.append(own)
+            if resembles:
+                break  # what explains less is no better a name for this heat
+        else:
+            passed.append(own)
+            if is_free or stands(state.trial, own.trial):
+                break
+    state.rejected += refused
+    if not passed:
+        state.rejected += weak
+        return False
+    named = passed[-1] if is_free or stands(state.trial, passed[-1].trial) else passed[0]
+    others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused)]
+    state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
+    state.trial = named.trial
+    return True
 
 
 def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:

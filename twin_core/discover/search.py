@@ -13,11 +13,13 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
+from twin_core.discover.coarseness import by_chance, least_explained, stands
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
     NO_MORE,
+    OUTDONE,
     SMALL_REMAINDER,
     Finding,
     Judged,
@@ -46,6 +48,9 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
+
+N_EXCHANGED = 2
+"""Refused options that are tried in the place of a finding."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -86,7 +91,11 @@ def search(
     needed = threshold(false_alarm_rate)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
-        if not _extend(state, needed, fallback=False):
+        before = state.fork()
+        extended = _extend(state, needed, fallback=False)
+        if exchange(before, state.rejected[len(before.rejected) :], needed):
+            state.join(before)
+        elif not extended:
             break
         prune(state, needed)
     withdraw(state, needed)
@@ -101,7 +110,7 @@ def search(
 def _name_what_leaves_little(state: Search, needed: float) -> None:
     """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
 
-    If it stands, and is likelier than the heat without a name that was found instead.
+    If it stands, and predicts what it was not fitted to better than the heat without a name that was found instead.
     """
     near = [j for j in state.rejected if j.reason == SMALL_REMAINDER and len(j.trial.effects) == len(j.effects)]
     if not near:
@@ -110,12 +119,8 @@ def _name_what_leaves_little(state: Search, needed: float) -> None:
     rest = [j for j in state.rejected if j.effects != best.effects]
     named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
     withdraw(named, needed)
-    if named.findings and _worth_of_all(named) < _worth_of_all(state):
+    if named.findings and best.validation and all(best.validation.foresight < f.foresight for f in state.findings):
         state.join(named)
-
-
-def _worth_of_all(state: Search) -> float:
-    return sum(worth(finding.judged) for finding in state.findings)
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
@@ -130,7 +135,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
     told = state.attempt(first, f"{what}, by what the filter leaves")
-    if not widened or (told and mean_excess(by_heat.trial) <= policy.MOST_COARSENESS):
+    after = by_heat.trial
+    if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
         return bool(told)
     beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
@@ -302,26 +308,42 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
         _drop(state, places, *without)
 
 
-def by_chance(n_readings: int) -> float:
-    """Return the variance, in units of the sensors' noise, up to which what stays of so many readings is chance."""
-    return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
+def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
+    """Put an effect that was refused beside a finding in its place, if both act there and it explains more; False if none does.
 
-
-def least_explained(beside: float, left: float, n_readings: int) -> float:
-    """Return the variance that names must explain, in units of the sensors' noise.
-
-    Parameters
-    ----------
-    beside
-        What counts as left beside them.
-    left
-        What stays unexplained. Where that is more than chance leaves of ``n_readings`` independent readings, whose variance has
-        a standard error of sqrt(2 / n), the network is seen to be coarse.
-    n_readings
-        How many there are.
+    The first look may take a part of what is missing for the whole: a heater that came on once for a load with an onset. What
+    switches it off again is then tried beside it, where it does not belong.
     """
-    shown = min(max(left / by_chance(n_readings) - 1.0, 0.0), 1.0)
-    return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
+    layout = state.trial.fit.network.layout
+    for option in sorted(refused, key=worth)[:N_EXCHANGED]:
+        for finding in state.findings:
+            here, there = ({n for e in j.effects for n in touched_nodes(e, layout)} for j in (option, finding.judged))
+            if here & there and len(option.effects) == 1 and worth(option) < worth(finding.judged):
+                replaced = partial(_in_place_of, state, finding, option, needed)
+                if state.attempt(replaced, f"{option.labels} in place of {finding.judged.labels}"):
+                    return True
+    return False
+
+
+def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float) -> bool:
+    """Take an option instead of a finding, if it is likelier by the odds asked for and passes; return whether it did."""
+    places = {effect.place for effect in finding.effects}
+    kept = _attempted_without(state, places)
+    if kept is None:
+        return False
+    without, lost = kept
+    trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
+    instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
+    if instead.evidence.log_bayes_factor <= lost + needed:
+        return False
+    examined, _ = examine(without, instead, needed)
+    if examined.reason:
+        return False
+    state.rejected = [j for j in state.rejected if j.effects != option.effects]
+    state.rejected.append(replace(finding.judged, reason=OUTDONE))
+    state.findings = [Finding(examined) if f is finding else f for f in state.findings]
+    state.trial = trial
+    return True
 
 
 def prune(state: Search, needed: float) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.straight_line import range_of_slope, slope_quality
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Capacity, Entry
 from twin_core.parameters.parameter import Parameter
@@ -62,7 +63,7 @@ class CapacityTemperature(Effect):
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the relative change of capacity per kelvin."""
-        return (Quality("kappa_per_K", "1/K", null=0.0),)
+        return (slope_quality("kappa_per_K", self.settings),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of capacity."""
@@ -79,5 +80,7 @@ class CapacityTemperature(Effect):
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the null effect about the mean temperature."""
-        reference = float(survey.temperature_K(where["node"]).mean())
-        yield cls(where, {"kappa_per_K": 0.0}, {"T_ref_K": reference})
+        temperature_K = survey.temperature_K(where["node"])
+        reference_K = float(temperature_K.mean())
+        within = range_of_slope(temperature_K, reference_K, LEAST_SHARE)
+        yield cls(where, {"kappa_per_K": 0.0}, {"T_ref_K": reference_K, **within})

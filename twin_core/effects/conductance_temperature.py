@@ -10,6 +10,7 @@ from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
 from twin_core.effects.declared import conductor_places, declared_conductor
 from twin_core.effects.missing_conductor import PairConductor
+from twin_core.effects.straight_line import range_of_slope, slope_quality
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, BoundaryConductor, Entry, Heat, pair_jacobian
 from twin_core.parameters.parameter import Parameter
@@ -69,7 +70,7 @@ class ConductanceTemperature(Effect):
 
     def qualities(self) -> tuple[Quality, ...]:
         """Return the temperature coefficient."""
-        return (Quality("beta_per_K", "1/K", null=0.0),)
+        return (slope_quality("beta_per_K", self.settings),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of the declared conductor."""
@@ -86,4 +87,6 @@ class ConductanceTemperature(Effect):
         """Yield the null effect about the mean temperature of the pair: it is linear in beta."""
         blank = cls(where, {"beta_per_K": 0.0}, {"T_ref_K": 0.0})
         ends = end_temperatures_K(declared_conductor(blank, survey.layout)[0], survey.along)
-        yield cls(where, blank.values, {"T_ref_K": float(0.5 * (ends[0] + ends[1]).mean())})
+        mean_K = 0.5 * (ends[0] + ends[1])
+        reference_K = float(mean_K.mean())
+        yield cls(where, blank.values, {"T_ref_K": reference_K, **range_of_slope(mean_K, reference_K)})

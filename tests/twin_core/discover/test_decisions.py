@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from twin_core.discover import judge, policy
 from twin_core.discover import search as searching
+from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -19,6 +20,7 @@ from twin_core.discover.judge import (
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
+    OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     Finding,
@@ -42,7 +44,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import _name_what_leaves_little, least_explained, withdraw
+from twin_core.discover.search import _name_what_leaves_little, exchange, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -157,10 +159,12 @@ def test_every_set_of_effects_counts_once_at_its_best() -> None:
 
 @pytest.fixture
 def examined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the foresight of an option as it stands, and one at node ``form`` for no law."""
+    """Take the foresight of an option as it stands, one at node ``form`` for no law, and one at ``x…`` for less likely."""
 
     def told(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         assert option.validation is not None
+        if option.effects[0].where["node"].startswith("x"):
+            return replace(option, validation=None, reason=LESS_LIKELY), False
         if not option.validation.foresight < FORESIGHT:
             return replace(option, reason=NO_FORESIGHT), False
         is_form = option.effects[0].where["node"] == "form"
@@ -181,14 +185,55 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         ([judged("a", 90.0), judged("b", 60.0)], "a", []),
         ([judged("form", 90.0), judged("b", 60.0)], None, [NO_LAW]),
         ([judged("form", 90.0), judged("b", 3.0)], None, [NO_LAW, NOT_SUPPORTED]),
+        ([*(judged(f"x{i}", 90.0 - i) for i in range(5)), judged("b", 60.0)], "b", [LESS_LIKELY] * 5),
+        ([*(judged(f"a{i}", 90.0 - i, foresight=1.0) for i in range(3)), judged("b", 60.0)], None, [NO_FORESIGHT] * 3),
     ],
-    ids=["likely", "at the odds", "no better", "hardly better", "the next", "the likeliest", "no law", "nothing else"],
+    ids=[
+        "likely",
+        "at the odds",
+        "no better",
+        "hardly better",
+        "the next",
+        "the likeliest",
+        "no law",
+        "nothing else",
+        "what is seen at once costs nothing",
+        "so many are validated",
+    ],
 )
 def test_what_is_accepted(options: list[Judged], named: str | None, reasons: list[str]) -> None:
     state = Search(stub(left=9.0), stub(left=9.0))
     assert accept(state, options, NEEDED) == (named is not None)
     assert [f.effects[0].where["node"] for f in state.findings] == ([] if named is None else [named])
     assert [j.reason for j in state.rejected] == reasons
+
+
+@pytest.mark.usefixtures("examined")
+@pytest.mark.parametrize(
+    ("left", "named"),
+    [((7.0, 0.5), "b"), ((7.0, 7.0), "a"), ((0.5, 0.0), "a")],
+    ids=["one that stands", "none that does", "the likeliest stands"],
+)
+def test_what_would_be_withdrawn_is_named_where_no_other_one_passes(left: tuple[float, float], named: str) -> None:
+    state = Search(stub(left=9.0), stub(left=9.0))
+    assert accept(state, [judged("a", 90.0, left=left[0]), judged("b", 60.0, left=left[1])], NEEDED)
+    assert [f.effects[0].where["node"] for f in state.findings] == [named] and not state.rejected
+
+
+@pytest.mark.parametrize(
+    ("before", "left", "kept"),
+    [
+        (2.0 * CHANCE, CHANCE, True),
+        (DOMINANCE * LEAST + 0.5, 0.5, True),
+        (DOMINANCE * LEAST + 0.5 - JUST, 0.5, False),
+        (50.0 + DOMINANCE * MOST - JUST, 50.0, False),
+    ],
+    ids=["fits to the noise", "just enough", "too little", "beside what is no coarseness"],
+)
+def test_open_loop_residuals_are_asked_too_where_a_name_would_be_withdrawn(
+    before: float, left: float, kept: bool
+) -> None:
+    assert stands(stub(left=before), stub(load("n0"), left=left)) == kept
 
 
 @pytest.mark.parametrize(
@@ -361,11 +406,11 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
 
 
-@pytest.mark.parametrize(("found", "names"), [(None, ["a"]), (90.0 - JUST, ["a"]), (90.0, ["f"])])
-def test_what_leaves_little_is_named_where_nothing_likelier_is_found(found: float | None, names: list[str]) -> None:
+@pytest.mark.parametrize(("found", "names"), [(None, ["a"]), (0.5 + JUST, ["a"]), (0.5, ["f"])])
+def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(found: float | None, names: list[str]) -> None:
     state = Search(stub(), stub())
     if found is not None:
-        state.findings = [Finding(judged("f", found))]
+        state.findings = [Finding(judged("f", 900.0, foresight=found))]
     likely, less = (replace(judged(node, nats), reason=SMALL_REMAINDER) for node, nats in (("a", 90.0), ("b", 60.0)))
     state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
     _name_what_leaves_little(state, NEEDED)
@@ -373,6 +418,39 @@ def test_what_leaves_little_is_named_where_nothing_likelier_is_found(found: floa
     named = names == ["a"]
     assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
     assert (state.trial is likely.trial) == named
+
+
+def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
+    effect = REGISTRY[kind]({"node": node}, {})
+    return Judged((effect,), Evidence(nats, 0.0), stub(effect), None, reason)
+
+
+@pytest.mark.parametrize(
+    ("option", "alone", "reason", "named"),
+    [
+        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED + JUST, "", "thermostat_heater"),
+        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED, "", "heat_load_step"),
+        (kind_at("thermostat_heater", "n0", 90.0), 99.0, NO_LAW, "heat_load_step"),
+        (kind_at("thermostat_heater", "n0", 20.0), 99.0, "", "heat_load_step"),
+        (kind_at("thermostat_heater", "n1", 90.0), 99.0, "", "heat_load_step"),
+    ],
+    ids=["explains more", "hardly more", "is no law", "was worth less beside it", "acts elsewhere"],
+)
+def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
+    monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
+) -> None:
+    monkeypatch.setattr(searching, "touched_nodes", lambda effect, layout: {effect.where["node"]})
+    monkeypatch.setattr(searching, "_attempted_without", lambda state, places: (stub(), 30.0))
+    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(searching, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    found = kind_at("heat_load_step", "n0", 30.0)
+    cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
+    refused = replace(option, reason=NO_FORESIGHT)
+    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[refused])
+    assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
+    assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
+    assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
