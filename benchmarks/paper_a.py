@@ -46,7 +46,7 @@ def main() -> None:
     for name, section in sections.items():
         if name in options.only:
             text, note = section()
-            save_table(f"paper_a_{name}", TITLES[name], text, f"benchmarks.paper_a --only {name}", note)
+            save_table(f"paper_a_{name}", TITLES[name], text, "benchmarks.paper_a", note)
 
 
 if __name__ == "__main__":

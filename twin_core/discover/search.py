@@ -110,7 +110,8 @@ def search(
 def _name_what_leaves_little(state: Search, needed: float) -> None:
     """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
 
-    If it stands, and predicts what it was not fitted to better than the heat without a name that was found instead.
+    If it stands, and predicts what it was not fitted to better than the heat without a name that was found instead; where both
+    predict alike, the likelier one counts.
     """
     near = [j for j in state.rejected if j.reason == SMALL_REMAINDER and len(j.trial.effects) == len(j.effects)]
     if not near:
@@ -119,8 +120,15 @@ def _name_what_leaves_little(state: Search, needed: float) -> None:
     rest = [j for j in state.rejected if j.effects != best.effects]
     named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
     withdraw(named, needed)
-    if named.findings and best.validation and all(best.validation.foresight < f.foresight for f in state.findings):
+    if named.findings and all(_is_better(named.findings[0], heat) for heat in state.findings):
         state.join(named)
+
+
+def _is_better(name: Finding, heat: Finding) -> bool:
+    """Return whether a name predicts better than a heat without one, or is likelier where chance tells them apart no further."""
+    if heat.foresight * policy.FORESIGHT <= name.foresight <= heat.foresight / policy.FORESIGHT:
+        return worth(name.judged) < worth(heat.judged)
+    return name.foresight < heat.foresight
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:

@@ -406,11 +406,24 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
 
 
-@pytest.mark.parametrize(("found", "names"), [(None, ["a"]), (0.5 + JUST, ["a"]), (0.5, ["f"])])
-def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(found: float | None, names: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("foresight", "nats", "names"),
+    [
+        (None, 0.0, ["a"]),
+        (0.5 / FORESIGHT + JUST, 900.0, ["a"]),
+        (0.5 / FORESIGHT - JUST, 900.0, ["f"]),
+        (0.5 * FORESIGHT + JUST, 90.0 - JUST, ["a"]),
+        (0.5 * FORESIGHT + JUST, 90.0, ["f"]),
+        (0.5 * FORESIGHT - JUST, 0.0, ["f"]),
+    ],
+    ids=["no heat", "predicts better", "as well, less likely", "as well, likelier", "as likely", "predicts worse"],
+)
+def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
+    foresight: float | None, nats: float, names: list[str]
+) -> None:
     state = Search(stub(), stub())
-    if found is not None:
-        state.findings = [Finding(judged("f", 900.0, foresight=found))]
+    if foresight is not None:
+        state.findings = [Finding(judged("f", nats, foresight=foresight))]
     likely, less = (replace(judged(node, nats), reason=SMALL_REMAINDER) for node, nats in (("a", 90.0), ("b", 60.0)))
     state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
     _name_what_leaves_little(state, NEEDED)
