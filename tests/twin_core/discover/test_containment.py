@@ -11,7 +11,9 @@ import pytest
 from numpy.linalg import LinAlgError
 
 from benchmarks.network_cases import network_case
-from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.optimise import Optimum
+from twin_core.calibrate.problem import Fit
+from twin_core.calibrate.second_order import fit_network, from_heat_fit
 from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.search import search
@@ -51,6 +53,13 @@ def failing(solver: Callable[..., Any], after: int, every: int) -> Callable[...,
         return solver(*arguments, **options)
 
     return work
+
+
+def test_a_candidate_without_a_trajectory_ends_as_a_numerical_failure(base: Trial) -> None:
+    """Of several records the first may have no open-loop solution, and the others were never rolled out."""
+    nothing = Optimum(base.fit.unknowns(), Fit(np.inf, (), ()), np.eye(1), "no_solution", 0)
+    with pytest.raises(ArithmeticError, match="no open-loop solution"):
+        from_heat_fit(base.fit, base.max_step_s, near=[nothing], afresh=False)
 
 
 @pytest.mark.parametrize("path", SOLVERS)
