@@ -105,11 +105,12 @@ def import_model(
     _write(out, found)
     if inputs is not None:
         _write_inputs(inputs, found, duration)
-    told = {"notes": list(found.notes), "left_out": refused}
+    beside = [f"{path}: lies beside the deck and was not given" for path in _others(files)] if kind == "sinda" else []
+    told = {"notes": [*found.notes, *beside], "left_out": refused}
     if as_json:
         print_line(to_json({"twin": spec.twin, "nodes": len(spec.nodes), **told}).rstrip())
         return
-    notify([*found.notes, *(f"left out: {line}" for line in refused)])
+    notify([*found.notes, *beside, *(f"left out: {line}" for line in refused)])
     couplings = len(spec.conductors) + len(spec.radiators) + len(spec.radiation)
     print_line(f"wrote {out}: {len(spec.nodes)} nodes, {couplings} couplings, {len(spec.loads)} loads")
 
@@ -144,14 +145,19 @@ def _without_nodes(kind: str, files: tuple[Path, ...]) -> str:
     names = ", ".join(map(str, files))
     if kind != "sinda":
         return f"{names}: declares no node"
-    parts = [path for path in files[0].parent.iterdir() if path.suffix in _PARTS and path not in files]
-    beside = " ".join(str(path) for path in sorted(parts, key=lambda path: _PARTS.index(path.suffix)))
+    beside = " ".join(map(str, _others(files)))
     advice = (
         f"give the files beside it too: twin import {' '.join(map(str, files))} {beside} --out SPEC"
         if beside
         else ("give the files that it inserts too (.cc with nodes and conductors, .k, .hra)")
     )
     return f"{names}: part of a SINDA deck that declares no node itself; {advice}"
+
+
+def _others(files: tuple[Path, ...]) -> list[Path]:
+    """Return the parts of a SINDA deck that lie beside the first file and were not given."""
+    parts = [path for path in files[0].parent.iterdir() if path.suffix in _PARTS and path not in files]
+    return sorted(parts, key=lambda path: (_PARTS.index(path.suffix), path.name))
 
 
 def _pairs(given: tuple[str, ...], option: str) -> dict[str, str]:

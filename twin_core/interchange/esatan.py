@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4, ZERO_CELSIUS_K
 from twin_core.errors import SpecError
 from twin_core.interchange.imported import Course, Imported, name_of, twin_id
 from twin_core.interchange.network import Deck, kelvin, specified
@@ -145,7 +146,10 @@ class _Reader:
         name, _, text = statement.partition("=")
         if not re.fullmatch(r"\s*\w+\s*", name) or not text:
             raise _UnknownError(f"'{statement[:60]}' is no definition")
-        self.values[name.strip().lower()] = self.number(text)
+        key, value = name.strip().lower(), self.number(text)
+        if key == "tabs" and abs(value - ZERO_CELSIUS_K) > 0.2:
+            raise _UnknownError(f"TABS is {value:g}: only temperatures in degC are read")
+        self.values[key] = value
 
     def declare_node(self, statement: str) -> None:
         """Read a node with what it has."""
@@ -282,6 +286,11 @@ def read_esatan(text: str, source: str, *, channels: Mapping[str, str] | None = 
         _exchange(reader)
     elif reader.views:
         deck.refused.append(f"{source}: {len(reader.views)} GV are used by no CALL VFAC")
+    if "stefan" in reader.values:
+        share = reader.values["stefan"] / STEFAN_BOLTZMANN_W_PER_M2_K4
+        deck.radiative = {pair: share * value for pair, value in deck.radiative.items()}
+    if not re.search(r"^\s*\$ENDMODEL\b", text, re.MULTILINE | re.IGNORECASE):
+        reader.refuse(len(text.splitlines()), "the deck ends without $ENDMODEL: a part of it is missing")
     if silent:
         deck.notes.append(f"{source}: {', '.join(sorted(silent))} say how to solve and print, and are not read")
     if reader.inactive:
@@ -423,6 +432,9 @@ def _logic(reader: _Reader, title: str, first: int, lines: list[str]) -> None:
             elif active:
                 reader.assign(line)
         except _UnknownError as error:
-            reader.refuse(n, f"${title}: {error}")
+            under = re.match(r"^(ELSE\s*)?IF\s*\(.+\)\s*THEN$", line, re.IGNORECASE)
+            if under:
+                taken.append([False, True])
+            reader.refuse(n, f"${title}: {error}{'; what stands under this condition is not read' if under else ''}")
         except IndexError:
             reader.refuse(n, f"${title}: '{line[:60]}' without an IF")

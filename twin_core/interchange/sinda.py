@@ -187,15 +187,18 @@ class _Reader:
         return True
 
     def _control(self, where: str, submodel: str, line: str) -> bool:
-        name, _, value = (part.strip() for part in line.partition("="))
-        if name.lower() == "sigma" and _is_number(value):
-            self.sigma = _float(value)
-        elif name.lower() == "abszro" and _is_number(value):
-            self.zero = _float(value)
-            if self.zero not in (0.0, -ZERO_CELSIUS_K, -273.0):
-                self.deck.refused.append(f"{where}: temperatures are neither K nor degC (abszro {value})")
-        elif name.upper() == "UID" and value.upper() != "SI":
-            self.deck.refused.append(f"{where}: units are '{value}'; only SI is read")
+        for setting in line.split(","):
+            name, _, value = (part.strip() for part in setting.partition("="))
+            if name.lower() in ("sigma", "abszro") and not _is_number(value):
+                return False
+            if name.lower() == "sigma":
+                self.sigma = _float(value)
+            elif name.lower() == "abszro":
+                self.zero = _float(value)
+                if self.zero not in (0.0, -ZERO_CELSIUS_K, -273.0):
+                    self.deck.refused.append(f"{where}: temperatures are neither K nor degC (abszro {value})")
+            elif name.upper() == "UID" and value.upper() != "SI":
+                self.deck.refused.append(f"{where}: units are '{value}'; only SI is read")
         return True
 
     def _array(self, where: str, submodel: str, line: str) -> bool:

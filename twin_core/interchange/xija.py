@@ -55,7 +55,10 @@ _POWER_STATES = ("0xxx", "1xxx", "2xxx", "3xx0", "3xx1", "4xxx", "5xxx", "66x0",
 
 @dataclass(frozen=True)
 class Component:
-    """One component of a model: its class, name, arguments by name, parameters by name, and the line where it stands."""
+    """One component of a model: its class, name, arguments by name, parameters by name, and the line where it stands.
+
+    ``surplus`` is an argument that its class does not have.
+    """
 
     kind: str
     name: str
@@ -63,6 +66,7 @@ class Component:
     pars: Mapping[str, float]
     free: frozenset[str]
     line: int
+    surplus: str = ""
 
     def par(self, name: str, default: float = 0.0) -> float:
         """Return the value of a parameter."""
@@ -252,13 +256,15 @@ def read_xija(
         if name not in names:
             known = ", ".join(sorted(n for n in names if n))
             raise SpecError(f"{source}: has no component '{name}' (it has {known})")
-    speed = _speeds(model, components)
+    speed = _speeds(model, components, source)
     write = _Writer(source, _capacities(components), channels or {}, constants or {}, held, spread, speed)
     for component in components:
         translate = _TRANSLATORS.get(component.kind)
         try:
             if translate is None:
                 raise _UnknownError("is not a component that can be translated")
+            if component.surplus:
+                raise _UnknownError(f"has the argument {component.surplus}, which is not read")
             if component.kind == "Node":
                 _node(write, component, hidden, model.get("limits") or {})
             else:
@@ -283,9 +289,12 @@ def _starts(components: Sequence[Component]) -> dict[str, float]:
 def _components(model: Mapping[str, Any], text: str, source: str) -> list[Component]:
     pars: dict[str, dict[str, float]] = {}
     free: dict[str, set[str]] = {}
-    for par in model.get("pars", ()):
-        owner, name = par["full_name"].rsplit("__", 1)
-        pars.setdefault(owner, {})[name] = float(par["val"])
+    for i, par in enumerate(model.get("pars") or ()):
+        try:
+            owner, name = par["full_name"].rsplit("__", 1)
+            pars.setdefault(owner, {})[name] = float(par["val"])
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise SpecError(f"{source}: pars[{i}] is no parameter of a Xija model ({error})") from error
         if not par.get("frozen", False):
             free.setdefault(owner, set()).add(name)
     found, offset = [], 0
@@ -293,7 +302,9 @@ def _components(model: Mapping[str, Any], text: str, source: str) -> list[Compon
         try:
             kind, name = str(comp["class_name"]), str(comp["name"])
             known = _SIGNATURES.get(kind, ())
-            args = dict(zip(known, comp.get("init_args", ()), strict=False)) | dict(comp.get("init_kwargs", {}))
+            told = comp.get("init_args", ())
+            args = dict(zip(known, told, strict=False)) | dict(comp.get("init_kwargs", {}))
+            beyond = [repr(a) for a in told[len(known) :]] + [repr(n) for n in args if n not in known]
         except (KeyError, TypeError, ValueError) as error:
             raise SpecError(f"{source}: comps[{i}] is no component of a Xija model ({error})") from error
         offset = max(text.find(f'"{kind}"', offset), 0)
@@ -301,12 +312,19 @@ def _components(model: Mapping[str, Any], text: str, source: str) -> list[Compon
         offset += 1
         owners = [o for o in pars if o == name] or [o for o in pars if name.startswith(f"{o}__")]
         owner = owners[0] if owners else name
-        found.append(Component(kind, name, args, pars.get(owner, {}), frozenset(free.get(owner, ())), line))
+        surplus = beyond[0] if known and beyond else ""
+        own = pars.get(owner, {}), frozenset(free.get(owner, ()))
+        found.append(Component(kind, name, args, *own, line, surplus))
     return found
 
 
 def _couplings(components: Sequence[Component]) -> dict[tuple[str, str], Component]:
-    return {(str(c.args["node1"]), str(c.args["node2"])): c for c in components if c.kind == "Coupling"}
+    whole = [c for c in components if c.kind == "Coupling" and _is_whole(c)]
+    return {(str(c.args["node1"]), str(c.args["node2"])): c for c in whole}
+
+
+def _is_whole(coupling: Component) -> bool:
+    return {"node1", "node2"} <= coupling.args.keys() and coupling.par("tau") > 0.0
 
 
 def _capacities(components: Sequence[Component]) -> dict[str, float]:
@@ -324,11 +342,14 @@ def _capacities(components: Sequence[Component]) -> dict[str, float]:
     return found
 
 
-def _speeds(model: Mapping[str, Any], components: Sequence[Component]) -> dict[str, float]:
+def _speeds(model: Mapping[str, Any], components: Sequence[Component], source: str) -> dict[str, float]:
     """Return node -> by how much its temperature moves faster than its time constants say."""
     if model.get("evolve_method") == 2:
         return dict.fromkeys((c.name for c in components if c.kind == "Node"), 1.0)
-    step_ks = 2.0 * float(model.get("dt", 328.0)) / 1000.0
+    try:
+        step_ks = 2.0 * float(model.get("dt", 328.0)) / 1000.0
+    except (TypeError, ValueError) as error:
+        raise SpecError(f"{source}: 'dt' of the model is no number ({error})") from error
     rate = {c.name: 0.0 for c in components if c.kind == "Node"}
     for c in components:
         node = str(c.args.get("node1" if c.kind == "Coupling" else "node"))
@@ -423,6 +444,8 @@ def _season() -> str:
 
 def _values(component: Component, prefix: str, pitches: Sequence[float]) -> tuple[list[float], list[str]]:
     names = [f"{prefix}_{p:.0f}" for p in pitches]
+    if lacking := [n for n in names if n not in component.pars]:
+        raise _UnknownError(f"has no parameter {', '.join(lacking)}")
     return [component.par(n) for n in names], names
 
 
@@ -521,6 +544,8 @@ def _off_nominal_roll(write: _Writer, component: Component) -> None:
 def _heat_sink(write: _Writer, component: Component) -> None:
     node, tau = str(component.args["node"]), component.par("tau", 20.0)
     sink_C = component.par("T")
+    if tau <= 0.0:
+        raise _UnknownError(f"has a tau of {tau:g}")
     if component.kind == "HeatSinkRef":
         sink_C = component.par("P") * tau + component.par("T_ref", 20.0)
     name = name_of(component.name)
@@ -598,6 +623,8 @@ def _mask(write: _Writer, component: Component) -> None:
 
 def _coupling(write: _Writer, component: Component) -> None:
     """Written after all, both ways together."""
+    if component.kind == "Coupling" and not _is_whole(component):
+        raise _UnknownError("does not name two nodes and a positive tau")
 
 
 _TRANSLATORS: dict[str, Callable[[_Writer, Component], None]] = {

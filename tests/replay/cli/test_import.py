@@ -21,6 +21,9 @@ def test_the_case_file_of_a_sinda_deck_names_the_files_to_give(
     advised = shlex.split(told[told.index("twin import") :].replace("SPEC", str(out)))[1:]
     assert main(advised) == 0
     assert "3 nodes" in capsys.readouterr().out
+    assert main(["import", str(tmp_path / "case.cc"), "--out", str(out)]) == 0
+    told = capsys.readouterr().err
+    assert all(f"{name}: lies beside the deck and was not given" in told for name in ("case.k", "case.hra"))
 
 
 def test_what_is_no_model_is_told_what_one_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -98,6 +98,8 @@ WRONG = {
     "GR(12, 99) = 0.01;": ("GR(12, 99) = INTRP1(T12, tab, 1);", "cannot use 'intrp1"),
     "QI11 = QI10 / 2": ("CALL HEATER(11)", "not understood"),
     "D10 = 'Pin', T = 0.0, C = 5.0;": ("D10 = 'Pin', T = 0.0, C = unheard;", "'unheard' is not known"),
+    "  $CONSTANTS\n": ("  $CONSTANTS\n    $CONTROL\n      TABS = 0.0;\n", "TABS is 0: only temperatures in degC"),
+    "IF (P .GE. 3.0D0) THEN": ("IF (T1 .GE. 3.0D0) THEN", "what stands under this condition is not read"),
     "  $ARRAYS\n": ("  $ARRAYS\n    tab = 1, 2;\n", "is no array of one or two dimensions"),
 }
 
@@ -109,6 +111,25 @@ def test_what_an_esatan_deck_cannot_say_is_one_line_with_its_place(old: str) -> 
     lines = read_esatan(text, "plate.d", held=True).refused
     number = 1 + text[: text.index(new.strip().splitlines()[-1].strip())].count("\n")
     assert any(said in line and line.startswith(f"plate.d: line {number}: ") for line in lines), lines
+
+
+def test_a_deck_that_was_cut_off_is_refused() -> None:
+    (line,) = read_esatan(ESATAN.replace("$ENDMODEL\n", ""), "plate.d", held=True).refused
+    assert "ends without $ENDMODEL" in line
+
+
+def test_nothing_under_a_condition_that_is_not_understood_is_taken() -> None:
+    deck = ESATAN.replace("IF (P .GE. 3.0D0) THEN", "IF (T1 .GE. 3.0D0) THEN").replace("QI11 = QI10 / 2", "QI11 = 3.0")
+    imported = read_esatan(deck, "plate.d", held=True)
+    assert len(imported.refused) == 1
+    assert {load["node"] for load in imported.data["loads"]} == {"n1", "n11"}
+
+
+def test_the_constant_of_radiation_is_the_decks_own() -> None:
+    constants = f"  $CONSTANTS\n    $CONTROL\n      STEFAN = {2.0 * SIGMA!r};\n"
+    own, usual = (read_esatan(text, "d", held=True) for text in (ESATAN.replace("  $CONSTANTS\n", constants), ESATAN))
+    areas = [[r["area_m2"]["value"] for r in found.data["radiation"]] for found in (own, usual)]
+    np.testing.assert_allclose(areas[0], 2.0 * np.array(areas[1]))
 
 
 def test_what_is_no_deck_is_refused() -> None:
@@ -185,6 +206,20 @@ def test_what_a_sinda_deck_cannot_say_is_one_line_with_its_place(line: str, said
     text = SINDA["case.cc"].replace("HEADER CONDUCTOR DATA, BOX", f"{line}\nHEADER CONDUCTOR DATA, BOX")
     refused = read_sinda({"case.cc": text}, held=True).refused
     assert any(r.startswith("case.cc: line 7: ") and said in r for r in refused), refused
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("NLOOPS = 1000, ABSZRO = -459.67", "neither K nor degC"),
+        ("SIGMA = TWO * 5.67E-8", "is not understood"),
+        ("UID = ENG, NLOOPS = 3", "units are 'ENG'"),
+    ],
+)
+def test_every_setting_of_a_line_counts(line: str, said: str) -> None:
+    case = SINDA["case.inp"].replace("    UID = SI\n", f"    {line}\n")
+    refused = read_sinda({"case.inp": case, "case.cc": SINDA["case.cc"]}, held=True).refused
+    assert any(r.startswith("case.inp: line 4: ") and said in r for r in refused), refused
 
 
 def test_a_node_that_cannot_lose_heat_has_no_steady_state() -> None:

@@ -189,6 +189,41 @@ def test_an_unknown_component_is_one_line_with_its_place() -> None:
     assert line == f"moon.json: line {number}: TidalHeat 'tide' is not a component that can be translated"
 
 
+def changed(kind: str, **members: Any) -> dict[str, Any]:
+    """Return the model with the first component of a class changed."""
+    whole = model()
+    next(c for c in whole["comps"] if c["class_name"] == kind).update(members)
+    return whole
+
+
+WRONG = {
+    "no P_90": (
+        model(pars=[p for p in model()["pars"] if p["full_name"] != "solarheat__skin__P_90"]),
+        "parameter P_90",
+    ),
+    "no nodes": (changed("Coupling", init_args=[]), "does not name two nodes and a positive tau"),
+    "surplus": (changed("Coupling", init_kwargs={"tau": 20.0, "tau_2": 3.0}), "the argument 'tau_2'"),
+    "no tau": (
+        model(pars=[p | {"val": 0.0} if p["full_name"].endswith("__tau") else p for p in model()["pars"]]),
+        "has a tau of 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_components_that_lack_what_they_need_are_refused_by_name(case: str) -> None:
+    data, said = WRONG[case]
+    assert any(said in line for line in read_xija(json.dumps(data), "m.json").refused)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"pars": [{"full_name": "x"}]}, {"pars": [{"full_name": "a__b", "val": "warm"}]}, {"dt": None}]
+)
+def test_numbers_that_are_none_are_told_with_the_file(wrong: dict[str, Any]) -> None:
+    with pytest.raises(SpecError, match=r"m\.json: "):
+        read_xija(json.dumps(model(**{"evolve_method": 1} | wrong)), "m.json")
+
+
 @pytest.mark.parametrize("text", ["[]", "{", '{"comps": 3}', '{"comps": [3]}'])
 def test_what_is_no_model_is_refused(text: str) -> None:
     with pytest.raises(SpecError, match=r"m\.json"):
