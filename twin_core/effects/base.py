@@ -96,7 +96,7 @@ class Quality:
     def moved(self, amount: float) -> float | None:
         """Return the value at a distance from null, None if it is not positive but must be.
 
-        Beyond a lower bound, or a small share of a positive null, it is put there: the distance is reckoned from a
+        Beyond a bound, or a small share of a positive null, it is put there: the distance is reckoned from a
         declared size that the missing effect has spoilt, so that what nearly vanishes may look like less than nothing.
         """
         assert self.null is not None
@@ -104,7 +104,7 @@ class Quality:
         if self.positive:
             value = max(value, LEAST_SHARE * self.null)
             return value if value > 1e-12 else None
-        return value if self.lower is None else max(value, self.lower)
+        return self.transform.to_value(value) if self.lower is not None or self.upper is not None else value
 
 
 @dataclass(frozen=True)
