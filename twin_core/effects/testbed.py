@@ -117,13 +117,19 @@ def null_effects(kind: type[Effect]) -> list[Effect]:
 def active_effect(kind: type[Effect], amount: float = 0.7) -> Effect:
     """Return an effect in the network with every term, its amplitudes moved from null by a positive amount.
 
+    Where less than one unit lies between null and an upper bound, by that share of it: on a bound nothing has a slope.
+
     Raises
     ------
     ModelError
         If it has no place there, or cannot have that amplitude.
     """
     start = null_effects(kind)[0]
-    moved = start.with_amplitudes(np.full(len(start.amplitudes), amount))
+    qualities = [start.qualities()[i] for i in start.amplitudes]
+    rooms = [
+        1.0 if q.upper is None or q.null is None or q.upper <= q.null else min(q.upper - q.null, 1.0) for q in qualities
+    ]
+    moved = start.with_amplitudes(amount * np.array(rooms))
     if moved is None:
         raise ModelError(f"effect {kind.name}: refuses amplitudes {amount:g} above null")
     return moved
