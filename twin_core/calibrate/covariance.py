@@ -58,6 +58,8 @@ def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener
     first = np.cumsum([0, *(s.record.time_s.size for s in problem.segments)])
     pulls = [_Pull.of(n, turned.shape[1]) for n in noise]
     for segment, samples, block in problem.jacobian_stretches(optimum.unknowns, optimum.fit):
+        if block.shape[0] == 0:  # a stretch within a long gap
+            continue
         at = slice(int(first[segment]) + samples.start, int(first[segment]) + samples.stop)
         columns = turned[np.r_[0 : problem.n_free, problem.start_columns(segment)]]
         together = max(1, MOST_TURNED // (block.shape[0] * columns.shape[1]))

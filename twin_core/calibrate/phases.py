@@ -30,6 +30,7 @@ is gone, were it slower by a factor of three."""
 SAMPLES_AT_REST = (50, 2000)
 """Fewest and most samples that stand for a phase at rest; in between it counts as much as the longest transient."""
 MOST_NAMED = 20
+"""Names in a message."""
 MOST_DRAWN = 3000
 """Samples of a transient in a picture."""
 LONGEST_S = 1e9

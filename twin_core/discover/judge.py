@@ -182,7 +182,10 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         state.rejected += weak
         return False
     named = passed[-1] if is_free or stands(state.trial, passed[-1].trial) else passed[0]
-    others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused)]
+    # What passed before it but explains too little is no alternative to a name that stands.
+    less = [j for j in passed if j is not named and (named is not passed[0] or not is_close(j, named))]
+    state.rejected += [replace(j, reason=NO_MORE) for j in less]
+    others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused + less)]
     state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
     state.trial = named.trial
     return True

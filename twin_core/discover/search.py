@@ -93,7 +93,8 @@ def search(
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
         before = state.fork()
         extended = _extend(state, needed, fallback=False)
-        if exchange(before, state.rejected[len(before.rejected) :], needed):
+        refused, before.rejected = state.rejected[len(before.rejected) :], list(state.rejected)
+        if exchange(before, refused, needed):
             state.join(before)
         elif not extended:
             break

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Quality
 
 
 def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: float = 0.0) -> dict[str, float]:
     """Return the settings that keep 1 + slope (T - T_ref) above a share at every temperature of the training record.
+
+    A bound that no temperature sets is left out.
 
     Parameters
     ----------
@@ -23,10 +23,8 @@ def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: f
     """
     below, above = reference_K - float(temperature_K.min()), float(temperature_K.max()) - reference_K
     most = 1.0 - least_share
-    return {
-        "least_per_K": -most / above if above > 0.0 else -np.inf,
-        "most_per_K": most / below if below > 0.0 else np.inf,
-    }
+    bounds = {"least_per_K": -most / above} if above > 0.0 else {}
+    return bounds | ({"most_per_K": most / below} if below > 0.0 else {})
 
 
 def slope_quality(name: str, settings: Mapping[str, Any]) -> Quality:

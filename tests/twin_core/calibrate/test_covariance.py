@@ -59,15 +59,20 @@ def test_it_is_that_of_least_squares_under_the_noise(monkeypatch: pytest.MonkeyP
 
 
 def test_records_may_come_in_stretches_and_sensors_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The covariance is the same, over two segments of which one lacks readings, as if all derivatives were held at once."""
+    """The covariance is the same as if all derivatives were held at once: over two segments, of which one lacks readings and has
+    a gap that fills stretches of its own."""
     first, second = telemetry(0, 0.05), telemetry(1, 0.05, n_times=150)
     first.values["T_b"][40:60] = np.nan
+    kept = np.r_[0:80, 230 : first.time_s.size]
+    first = Record(first.time_s[kept], {name: values[kept] for name, values in first.values.items()})
     done = fit_trajectories(load_spec(declared()), [first, second])
     arguments = (done.problem, done.optimum, done.whitener)
     once = trajectory_covariance(*arguments)
     monkeypatch.setattr(response, "MOST_VALUES", 1)
     monkeypatch.setattr(response, "LEAST_STEPS", 7)
     monkeypatch.setattr(covariance, "MOST_TURNED", 1)
+    stretches = [block for _, _, block in done.problem.jacobian_stretches(done.optimum.unknowns, done.optimum.fit)]
+    assert any(block.shape[0] == 0 for block in stretches)
     std = np.sqrt(np.diag(once))
     np.testing.assert_allclose((trajectory_covariance(*arguments) - once) / np.outer(std, std), 0.0, atol=1e-9)
 

@@ -210,14 +210,18 @@ def test_what_is_accepted(options: list[Judged], named: str | None, reasons: lis
 
 @pytest.mark.usefixtures("examined")
 @pytest.mark.parametrize(
-    ("left", "named"),
-    [((7.0, 0.5), "b"), ((7.0, 7.0), "a"), ((0.5, 0.0), "a")],
+    ("left", "named", "rejected"),
+    [((7.0, 0.5), "b", [("a", NO_MORE)]), ((7.0, 7.0), "a", [("b", NO_MORE)]), ((0.5, 0.0), "a", [])],
     ids=["one that stands", "none that does", "the likeliest stands"],
 )
-def test_what_would_be_withdrawn_is_named_where_no_other_one_passes(left: tuple[float, float], named: str) -> None:
+def test_what_would_be_withdrawn_is_named_where_no_other_one_passes(
+    left: tuple[float, float], named: str, rejected: list[tuple[str, str]]
+) -> None:
     state = Search(stub(left=9.0), stub(left=9.0))
     assert accept(state, [judged("a", 90.0, left=left[0]), judged("b", 60.0, left=left[1])], NEEDED)
-    assert [f.effects[0].where["node"] for f in state.findings] == [named] and not state.rejected
+    assert [f.effects[0].where["node"] for f in state.findings] == [named]
+    assert [(j.effects[0].where["node"], j.reason) for j in state.rejected] == rejected
+    assert not state.findings[0].alternatives
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """A property that is a straight line over temperature stays positive wherever the training record has been."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,5 +26,4 @@ def test_without_a_training_record_there_is_no_range() -> None:
 
 
 def test_one_temperature_alone_tells_no_range() -> None:
-    told = range_of_slope(np.full(3, 300.0), 300.0)
-    assert told == {"least_per_K": pytest.approx(-np.inf), "most_per_K": pytest.approx(np.inf)}
+    assert range_of_slope(np.full(3, 300.0), 300.0) == {}
