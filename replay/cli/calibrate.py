@@ -50,6 +50,10 @@ POSITIVE = click.FloatRange(min=0.0, min_open=True)
     type=click.IntRange(min=1),
     help="Of neural-ode: epochs without a lower validation loss until it stops.  [default: 200]",
 )
+@click.option("--start", metavar="TIME", help="Take only samples from this time on.")
+@click.option("--stop", metavar="TIME", help="Take only samples before this time.")
+@click.option("--samples", type=click.IntRange(min=20), help="Take at most so many, the newest.  [default: all]")
+@click.option("--thin", is_flag=True, help="Take them evenly over that time; inputs that hold have their mean.")
 @click.option("--no-masking", is_flag=True, help="Take every sample as a reading, frozen ones and spikes too.")
 @click.option("--deadline", type=POSITIVE_DURATION, help="Best answer after so many seconds (or 5min).")
 @click.option("--out", required=True, type=FILE, help="Model to write, .json.")
@@ -64,15 +68,20 @@ def calibrate(
     window: float | None,
     epochs: int | None,
     patience: int | None,
+    start: str | None,
+    stop: str | None,
+    samples: int | None,
+    thin: bool,
     no_masking: bool,
     deadline: float | None,
     out: Path,
     as_json: bool,
 ) -> None:
     """Calibrate the declared network against telemetry, with the uncertainty of every parameter."""
-    stop = inf if deadline is None else time.monotonic() + deadline
+    until = inf if deadline is None else time.monotonic() + deadline
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.recordings import check_suffix, load_records
+    from replay.cli.selection import Wanted, selected
     from twin_core.calibrate import calibrate as fit
     from twin_core.files import write_text
     from twin_core.network.spec_io import load_spec
@@ -82,10 +91,11 @@ def calibrate(
     training = {name: float(value) for name, value in given.items() if value is not None}
     if training and method != "neural-ode":
         raise click.UsageError("--learning-rate, --window, --epochs and --patience belong to --method neural-ode")
+    wanted = Wanted(start, stop, samples, thin)
     spec = load_spec(spec_file)
-    records = load_records(telemetry, spec, masking=not no_masking)
+    records = selected(spec, load_records(telemetry, spec, masking=not no_masking), wanted)
     with progress_bar("calibrating") as progress:
-        model = fit(spec, records, method=method, loss=loss, deadline=stop, training=training, progress=progress)
+        model = fit(spec, records, method=method, loss=loss, deadline=until, training=training, progress=progress)
     write_text(out, to_json(model.to_json()))
     notify(model.summary["notices"])
     if as_json:
