@@ -4,10 +4,12 @@ Each spacecraft is calibrated on fourteen orbits (healthy), or diagnosed on them
 model then carries); then forecasts of three orbits start at moments that neither saw. A flight set is calibrated on its first
 60 %; forecasts over a twentieth of the record start in the rest. A 90 % band should hold 85 to 95 % of the readings, and the
 simultaneous band all of one orbit's (of one horizon's) with 90 %. ``python -m benchmarks.forecast_coverage [--spacecraft N]
-[--effects none random] [--starts N] [--sets ROOT]`` writes ``benchmarks/tables/forecast_coverage.md``.
+[--effects none random] [--starts N] [--sets ROOT]`` writes ``benchmarks/tables/forecast_coverage.md``; without
+spacecraft (``--spacecraft 0``) the flight sets have a table of their own, ``forecast_coverage_flight.md``.
 """
 
 import argparse
+import os
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -102,7 +104,14 @@ def rows_of(
     for mode in MODES:
         inside, whole = count(mode)
         ahead = [f"{share:.1%}" for share in inside.mean(axis=0)]
-        row = [*label, mode, f"{inside.mean():.1%}", ", ".join(ahead), f"{whole.mean():.0%} of {whole.size}"]
+        error = inside.mean(axis=1).std(ddof=1) / np.sqrt(len(inside))
+        row = [
+            *label,
+            mode,
+            f"{inside.mean():.1%} ± {error:.1%}",
+            ", ".join(ahead),
+            f"{whole.mean():.0%} of {whole.size}",
+        ]
         print(" | ".join(row), flush=True)
         yield row, inside.mean(axis=0), float(whole.mean())
 
@@ -113,7 +122,7 @@ def main() -> None:
     parser.add_argument("--spacecraft", type=int, default=4, help="how many spacecraft of each kind, from seed 0")
     parser.add_argument("--effects", nargs="*", default=["none", "random"], choices=["none", "random"])
     parser.add_argument("--starts", type=int, default=8, help="forecasts of each")
-    parser.add_argument("--sets", type=Path, help="folder of measured sets")
+    parser.add_argument("--sets", type=Path, default=os.environ.get("MEASURED_DATA"), help="folder of measured sets")
     arguments = parser.parse_args()
     rows: list[Row] = []
     totals: dict[str, list[tuple[np.ndarray, float]]] = {mode: [] for mode in MODES}
@@ -131,7 +140,12 @@ def main() -> None:
         if found:
             ahead = np.mean([inside for inside, _ in found], axis=0)
             shares, whole = ", ".join(f"{share:.1%}" for share in ahead), np.mean([w for _, w in found])
-            rows.append(["all orbits", "", "", mode, f"{ahead.mean():.1%}", shares, f"{whole:.0%}"])
+            error = (
+                np.std([inside.mean() for inside, _ in found], ddof=1) / np.sqrt(len(found))
+                if len(found) > 1
+                else np.nan
+            )
+            rows.append(["all orbits", "", "", mode, f"{ahead.mean():.1%} ± {error:.1%}", shares, f"{whole:.0%}"])
     for name in FLIGHT_SETS if arguments.sets else ():
         if not ((arguments.sets / name).is_dir() and (EXAMPLES / FLIGHT_SETS[name][0]).is_file()):
             continue
@@ -152,10 +166,12 @@ def main() -> None:
     note = (
         "The readings are those of the sensors, noise included. plan: inputs as they came; auto: no plan, periodic inputs "
         "repeat and the others hold; hold: no plan, all hold. whole orbit inside: share of sensors and starts whose every "
-        "reading of the first orbit (of the horizon, on flight sets) lies in the simultaneous 90 % band."
+        "reading of the first orbit (of the horizon, on flight sets) lies in the simultaneous 90 % band. ±: standard error, from "
+        "how the starts of a record differ, or the spacecraft."
     )
     table = markdown_table(header, rows)
-    save_table("forecast_coverage", "Coverage of the forecast's bands", table, "benchmarks.forecast_coverage", note)
+    name, of = ("forecast_coverage", "") if arguments.spacecraft else ("forecast_coverage_flight", " on flight sets")
+    save_table(name, f"Coverage of the forecast's bands{of}", table, "benchmarks.forecast_coverage", note)
 
 
 if __name__ == "__main__":
