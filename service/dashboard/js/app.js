@@ -243,20 +243,23 @@ function limits(list, unit, from) {
 // What happened in the time shown: modes and heaters that changed, models that were activated.
 function marks() {
   const { archive } = state, found = [];
-  for (const { name, kind, levels } of drivers()) {
+  for (const { name, kind, levels, unit } of drivers()) {
+    const said = (value, last) => (levels ? value : value === 0 ? "off" : last === 0 ? "on" : `${value} ${unit}`);
     const column = archive.values[name] || [], known = column.filter((v) => v !== null);
     if (!levels && !(kind === "power" && new Set(known).size <= 3)) continue;
     let last = null;
     const changes = [];
     column.forEach((value, i) => {
       if (value === null) return;
-      if (last !== null && value !== last) changes.push({ time: seconds(archive.time[i]), text: levels ? `${name} ${value}` : `${name} ${value > last ? "on" : "off"}` });
+      if (last !== null && value !== last) changes.push({ time: seconds(archive.time[i]), text: `${name} ${said(value, last)}` });
       last = value;
     });
     if (levels || changes.length <= MOST_CHANGES) found.push(...changes);
   }
-  for (const { version, time } of state.activations) found.push({ time: seconds(time), text: `model v${version}` });
-  return found.sort((a, b) => a.time - b.time);
+  const together = new Map();  // what changed at one moment has one mark
+  for (const { time, text } of found) together.set(time, together.has(time) ? `${together.get(time)}, ${text}` : text);
+  const models = state.activations.map(({ version, time }) => ({ time: seconds(time), text: `model v${version}` }));
+  return [...[...together].map(([time, text]) => ({ time, text })), ...models].sort((a, b) => a.time - b.time);
 }
 
 function renderInputs(unit) {

@@ -141,9 +141,10 @@ export class NetworkDrawing {
     const way = link.heat_W < 0 ? [...link.ends].reverse() : link.ends;
     flow.append(draw("title", {}, `${way.join(" → ")}: ${watts(Math.abs(link.heat_W))}`));
     flow.dataset.ends = link.ends.join("|");
-    labels.push(draw("text", { x: middle[0], y: middle[1] - 9, class: "value halo" }, watts(Math.abs(link.heat_W))));
-    if (share < 0.004) return [...parts, flow];
-    const [from, to] = link.heat_W < 0 ? [b, a] : [a, b], size = 5 + width;
+    const size = 5 + width, flows = share >= 0.004;  // the figure stands clear of the arrowhead
+    labels.push(draw("text", { x: middle[0], y: middle[1] - (flows ? size + 4 : 9), class: "value halo" }, watts(Math.abs(link.heat_W))));
+    if (!flows) return [...parts, flow];
+    const [from, to] = link.heat_W < 0 ? [b, a] : [a, b];
     const turn = (Math.atan2(to[1] - from[1], to[0] - from[0]) * 180) / Math.PI;
     const head = draw("path", { d: `M${size} 0L${-size * 0.7} ${size * 0.75}L${-size * 0.7} ${-size * 0.75}Z`, class: "head", fill: link.kind === "radiator" ? "#7a6ff0" : "#e8743b", transform: `translate(${middle[0]} ${middle[1]}) rotate(${turn})` });
     return [...parts, flow, head];
