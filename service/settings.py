@@ -65,6 +65,9 @@ class Settings(BaseSettings):
         description="Where jobs compute: `process`, or `dask://HOST:PORT`, the scheduler of a Dask cluster.",
     )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
+    job_search_s: float = Field(
+        240.0, gt=0, description="A job that searches longer goes on with the best so far unless its request says more."
+    )
     job_values: int = Field(
         250_000,
         ge=1000,

@@ -131,7 +131,8 @@ def _decide(connection: Connection, twin: int, finished: Finished) -> Decision:
 
 def _message(finished: Finished, version: int | None, decision: Decision) -> str:
     """Return the outcome in one line, what could not be scored included."""
-    part = f"; from {finished.part}" if finished.part else ""
+    part = "; its search ended at its deadline with the best so far" if finished.outcome.cut_short else ""
+    part += f"; from {finished.part}" if finished.part else ""
     if version is None:
         return decision.reason + part
     unscored = finished.outcome.validation.get("rmse_K") is None

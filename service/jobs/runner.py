@@ -74,16 +74,18 @@ class Jobs:
         executor: Tasks,
         workers: int,
         job_values: int,
+        search_s: float,
         on_model: Callable[[int], None],
         find: Callable[[int], Awaitable[Entry | None]],
     ) -> None:
         """Do at most ``workers`` jobs at a time in an executor; a job takes ``job_values`` values unless asked for more.
 
+        Its search ends after ``search_s`` unless it is given another deadline.
         ``on_model`` hears of every twin whose active model changed; ``find`` returns a twin by its number.
         """
         self._database, self._hub, self._metrics = database, hub, metrics
         self._workbench, self._on_model, self._find = workbench, on_model, find
-        self._executor, self._job_values = executor, job_values
+        self._executor, self._job_values, self._search_s = executor, job_values, search_s
         self._name = f"{socket.gethostname()}:{os.getpid()}:{uuid.uuid4().hex[:6]}"
         self._free = asyncio.Semaphore(workers)
         self._running: dict[str, _Running] = {}
@@ -270,12 +272,16 @@ class Jobs:
         active: Active | None,
         siblings: dict[str, Json],
     ) -> tuple[CalibrationTask | DiagnosisTask, str]:
+        deadline_s = request.get("deadline_s") or self._search_s
         if kind == "diagnosis":
             options = {name: request[name] for name in ("holdout", "burn_in_s", "false_alarm_rate")}
-            return DiagnosisTask(twin.specification, telemetry, **options, siblings=siblings), "diagnose"
+            return DiagnosisTask(
+                twin.specification, telemetry, **options, deadline_s=deadline_s, siblings=siblings
+            ), "diagnose"
         rival = None if active is None else active.parsed()
         cut = validation_start(telemetry, None if active is None else active.train_stop_us)
-        return CalibrationTask(twin.specification, telemetry, cut, request["method"], rival, siblings), "calibrate"
+        task = CalibrationTask(twin.specification, telemetry, cut, request["method"], deadline_s, rival, siblings)
+        return task, "calibrate"
 
     async def choose(self, twin: Entry, request: Json) -> Selection:
         """Return the part of the archive that a request names; TooLittle if it holds too little."""

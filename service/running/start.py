@@ -55,6 +55,7 @@ async def running(
         *rooms,
         settings.job_workers,
         settings.job_values,
+        settings.job_search_s,
         live_state.model_changed,
         lambda twin: service.find_key(twin),
     )

@@ -14,12 +14,14 @@ class _Selecting(Request):
     """Which part of the archive a job looks at: the newest ``samples`` of start <= time < stop.
 
     With ``thin`` it looks at as many samples evenly over that time instead, of which inputs that hold have their mean.
+    Its search ends after ``deadline_s`` with the best so far.
     """
 
     start: Time | None = None
     stop: Time | None = None
     samples: Annotated[int, Field(ge=20)] | None = Field(default=None, description="absent: as TWIN_JOB_VALUES says")
     thin: bool = False
+    deadline_s: Positive | None = Field(default=None, description="absent: as TWIN_JOB_SEARCH_S says")
 
 
 class CalibrationRequest(_Selecting):

@@ -1,5 +1,6 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -48,6 +49,8 @@ class CoreWorkbench:
         """Fit the declared network."""
         from twin_core.calibrate import calibrate
 
+        deadline = time.monotonic() + task.deadline_s
+
         siblings = {name: _model_of(document) for name, document in task.siblings.items()}
         spec = _with_prior(_spec(task.specification), siblings)
         whole, telemetry = _screened(spec, task.telemetry)
@@ -56,6 +59,7 @@ class CoreWorkbench:
             spec,
             [replace(_record(spec, train), flaws=whole.flaws, notices=whole.notices)],
             method=task.method,
+            deadline=deadline,
             progress=lambda fraction, message: progress(0.9 * fraction, message),
         )
         progress(0.92, "scoring on recent data")
@@ -68,7 +72,8 @@ class CoreWorkbench:
             "samples": int(recent.time_us.size),
         }
         outcome = _outcome(model, validation, rival)
-        return replace(outcome, extra=outcome.extra | _beside_family(model, siblings))
+        extra = outcome.extra | _beside_family(model, siblings)
+        return replace(outcome, extra=extra, cut_short=model.summary["status"] == "deadline")
 
     def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
         """Close the loop."""
@@ -82,6 +87,7 @@ class CoreWorkbench:
             holdout=task.holdout,
             burn_in_s=task.burn_in_s,
             false_alarm_rate=task.false_alarm_rate,
+            deadline_s=task.deadline_s,
             first=[effect for document in task.siblings.values() for effect in _model_of(document).effects],
             progress=progress,
         )
@@ -97,6 +103,7 @@ class CoreWorkbench:
             report=loop.report,
             page=render(loop.report, loop.plots),
             extra=outcome.extra,
+            cut_short=not loop.report["search"]["complete"],
         )
 
     def inspect(self, document: Json) -> Outcome:

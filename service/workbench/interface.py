@@ -91,6 +91,8 @@ class CalibrationTask:
     telemetry: Telemetry
     validation_us: int
     method: str
+    deadline_s: float
+    """The search ends after so many seconds with the best so far."""
     rival: Json | None = None
     siblings: Mapping[str, Json] = field(default_factory=dict)
     """Active models of other spacecraft of the design: they tell where parameters lie before any telemetry does."""
@@ -105,6 +107,8 @@ class DiagnosisTask:
     holdout: float
     burn_in_s: float | None
     false_alarm_rate: float
+    deadline_s: float
+    """As of a calibration."""
     siblings: Mapping[str, Json] = field(default_factory=dict)
     """Active models of other spacecraft of the design: their effects are looked for first."""
 
@@ -121,6 +125,8 @@ class Outcome:
     report: Json | None = None
     page: str | None = None
     extra: Json = field(default_factory=dict)
+    cut_short: bool = False
+    """Whether the search ended at its deadline."""
 
 
 @dataclass(frozen=True)

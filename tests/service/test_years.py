@@ -1,7 +1,9 @@
 """What a twin needs that is kept for years: windows, bounds, exports, retention, deletion in pieces."""
 
+import csv
 import io
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,13 @@ from service.jobs.executor import JobFailed, ProcessPerTask, Task
 from service.store import retention, samples, selection
 from service.store.batch import Batch
 from service.store.database import Database
+from service.workbench.core import CoreWorkbench
+from service.workbench.interface import DiagnosisTask, Telemetry
 from tests.service.conftest import SPEC, STORE, Sql
-from tests.service.fakes import FakeWorkbench
+from tests.service.fakes import SHORTEST_SEARCH_S, FakeWorkbench
 from tests.service.harness import AppClient
 from tests.service.test_jobs import finish
+from twin_core._typing import no_progress
 
 TWIN = "/v1/twins/benchsat"
 N = 3000
@@ -90,6 +95,27 @@ def test_a_job_takes_the_newest_samples_and_says_so(make_client: Any) -> None:
     job = calibrate(client, {"samples": 5000})
     assert "samples" not in job["message"].partition("; from")[2]
     assert client.post(f"{TWIN}/calibrations", json={"samples": 3}).status_code == 422
+
+
+def test_a_search_has_a_deadline_and_one_that_was_cut_short_is_told(make_client: Any) -> None:
+    client = make_client(FakeWorkbench, job_search_s=SHORTEST_SEARCH_S - 1.0)
+    client.post("/v1/twins", json=SPEC)
+    ingest(client, 0, 500)
+    assert "its search ended at its deadline" in calibrate(client, {})["message"]
+    assert "deadline" not in calibrate(client, {"deadline_s": SHORTEST_SEARCH_S})["message"]
+    assert client.post(f"{TWIN}/calibrations", json={"deadline_s": 0}).status_code == 422
+
+
+def test_a_diagnosis_that_had_no_time_answers_and_says_so(
+    pair_declared: dict[str, Any], pair_telemetry: Callable[[int], str]
+) -> None:
+    rows = list(csv.DictReader(io.StringIO(pair_telemetry(120))))
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in ("T_a", "T_b", "Q_a")}
+    columns["Q_a"][60:] *= 1.5
+    telemetry = Telemetry(0, 60_000_000 * np.arange(120), columns)
+    task = DiagnosisTask(pair_declared, telemetry, 0.3, None, 0.01, deadline_s=1e-3)
+    made = CoreWorkbench().diagnose(task, no_progress)
+    assert made.cut_short and made.report is not None and made.report["search"]["left_out"] > 0
 
 
 def test_a_window_knows_the_inputs_that_hold_where_it_begins(database: Database) -> None:
