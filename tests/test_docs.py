@@ -156,7 +156,7 @@ def test_every_decision_follows_the_form() -> None:
         assert all(f"**{part}.**" in text for part in ("Decision", "Why", "Price"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_quick_start_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
