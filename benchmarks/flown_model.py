@@ -18,7 +18,7 @@ from benchmarks.measured_splits import DATA, ROOT
 from twin_core._typing import FloatArray
 from twin_core.closed_loop import close_loop
 from twin_core.constants import ZERO_CELSIUS_K
-from twin_core.interchange.xija import read_xija
+from twin_core.interchange.xija.specification import read_xija
 from twin_core.network.model import build_network
 from twin_core.network.screened import screened
 from twin_core.network.spec_io import load_spec
