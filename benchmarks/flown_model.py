@@ -149,7 +149,9 @@ def loop_row(data: Path, deadline_s: float) -> list[str]:
     )
     before, after = (f"{loop.report[when]['rmse_K']:.2f}" for when in ("before", "after"))
     said = "; ".join(sentence(finding) for finding in loop.report["findings"]) or "nothing"
-    return ["as it flew", before, after, loop.report["verdict"], said]
+    ended = any("the deadline ended the search" in notice for notice in loop.report["notices"])
+    told = f"the deadline of {deadline_s:g} s ended the search" if ended else ""
+    return ["as it flew", before, after, loop.report["verdict"], said, told]
 
 
 def main() -> None:
@@ -158,7 +160,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA / "chandra_psmc", help="folder of the telemetry")
     parser.add_argument("--deadline", type=float, default=900.0, help="seconds for the search")
     given = parser.parse_args()
-    header = ["the imported model", "before, K", "after, K", "verdict", "what it lacks"]
+    header = ["the imported model", "before, K", "after, K", "verdict", "what it lacks", "notes"]
     table = markdown_table(header, [loop_row(given.data, given.deadline)])
     weeks = ", ".join(f"{rms:.3f}" for rms in repeated_rms_K().values())
     note = (
