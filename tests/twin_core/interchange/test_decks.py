@@ -230,7 +230,10 @@ OPERATION = "HEADER OPERATION DATA\n{}\nHEADER OUTPUT CALLS, BOX\n      CALL TPR
     [
         ("BUILD ALL", "BUILD ALL"),
         ("BUILD CASE, SPACE, BOX", "BUILD CASE, SPACE, BOX"),
-        ("BUILD ALL\n      CALL TDHTR\n      CALL STEADY\n      TIMEND = 5700.", "BUILD ALL; CALL TDHTR; CALL STEADY; TIMEND"),
+        (
+            "BUILD ALL\n      CALL TDHTR\n      CALL STEADY\n      TIMEND = 5700.",
+            "BUILD ALL; CALL TDHTR; CALL STEADY; TIMEND",
+        ),
     ],
 )
 def test_what_a_sinda_deck_runs_is_told(lines: str, said: str) -> None:
