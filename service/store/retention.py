@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import orjson
 
+from service.store import models
 from service.store.connection import Connection
 from service.store.errors import Conflicting, Missing
 
@@ -146,7 +147,7 @@ def _old_models(connection: Connection, twin: int, kept: Retention) -> int:
         return 0
     query = "SELECT version, summary FROM model WHERE twin = ? ORDER BY version DESC"
     rows = [(version, _parent(text)) for version, text in connection.execute(query, (twin,))]
-    active = _active(connection, twin)
+    active = models.active_version(connection, twin)
     stay = {active, *[version for version, _ in rows if version != active][: kept.models]}
     stay |= {parent for version, parent in rows if version in stay}
     gone = [version for version, _ in rows if version not in stay]
@@ -160,12 +161,6 @@ def _parent(summary: str) -> int | None:
     return found
 
 
-def _active(connection: Connection, twin: int) -> int | None:
-    query = "SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1"
-    row = connection.execute(query, (twin,)).fetchone()
-    return None if row is None else int(row[0])
-
-
 def remove_model(connection: Connection, twin: int, version: int) -> None:
     """Remove a version with all that was derived by it; its residuals go bit by bit, since their model is no more."""
     for table in ("checkpoint", "anomaly", "floor"):
@@ -177,7 +172,7 @@ def delete_model(connection: Connection, twin: int, version: int) -> None:
     """Remove a version; Missing if there is none, Conflicting if it is active."""
     if connection.execute("SELECT 1 FROM model WHERE twin = ? AND version = ?", (twin, version)).fetchone() is None:
         raise Missing(f"version: there is no model version {version}")
-    if version == _active(connection, twin):
+    if version == models.active_version(connection, twin):
         raise Conflicting(f"version {version} is active; activate another one first")
     remove_model(connection, twin, version)
 
@@ -192,7 +187,8 @@ def _dear_residuals(connection: Connection, twin: int) -> int:
         return removed
     size = "SELECT coalesce(sum(length(value) + 8 * n), 0) FROM {} WHERE twin = ?"
     versions = connection.execute(
-        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version != ?", (twin, _active(connection, twin) or 0)
+        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version != ?",
+        (twin, models.active_version(connection, twin) or 0),
     ).fetchall()
     if not versions or (
         connection.execute(size.format("residual"), (twin,)).fetchone()[0]
