@@ -71,23 +71,35 @@ def sweep_gone(connection: Connection) -> int:
     return 1
 
 
-def sweep_old(connection: Connection) -> int:
-    """Remove what a twin keeps no longer, and the messages that nobody can resume from."""
-    query = """SELECT twin.id, twin.retention, head.last_us, head.seq FROM twin JOIN head ON head.twin = twin.id"""
-    for twin, text, last_us, seq in connection.execute(query).fetchall():
-        removed = connection.execute(
-            """DELETE FROM event WHERE twin = ? AND seq IN
-               (SELECT seq FROM event WHERE twin = ? AND seq < ? ORDER BY seq LIMIT 500)""",
-            (twin, twin, seq - EVENTS),
-        ).rowcount
-        kept = Retention.of(text)
-        if not removed and last_us is not None:
-            removed = _old_samples(connection, twin, kept, last_us) or _old_residuals(connection, twin, kept, last_us)
-        removed = removed or _old_jobs(connection, twin, kept) or _old_models(connection, twin, kept)
-        removed = removed or _dear_residuals(connection, twin)
-        if removed:
-            return removed
-    return 0
+def due(connection: Connection) -> list[int]:
+    """Return the twins of which ``sweep_old`` may find something to remove: a look that a reader can take."""
+    query = """SELECT twin.id FROM twin JOIN head ON head.twin = twin.id WHERE twin.retention <> '{}'
+               OR EXISTS (SELECT 1 FROM event WHERE event.twin = twin.id AND event.seq < head.seq - ?)
+               OR EXISTS (SELECT 1 FROM residual WHERE residual.twin = twin.id AND residual.version <> coalesce(
+                  (SELECT version FROM activation WHERE activation.twin = twin.id ORDER BY id DESC LIMIT 1), 0))
+               ORDER BY twin.id"""
+    return [twin for (twin,) in connection.execute(query, (EVENTS,))]
+
+
+def sweep_old(connection: Connection, twin: int) -> int:
+    """Remove a part of what a twin keeps no longer, and of the messages that nobody can resume from."""
+    query = (
+        """SELECT twin.retention, head.last_us, head.seq FROM twin JOIN head ON head.twin = twin.id WHERE twin.id = ?"""
+    )
+    row = connection.execute(query, (twin,)).fetchone()
+    if row is None:
+        return 0
+    text, last_us, seq = row
+    removed = connection.execute(
+        """DELETE FROM event WHERE twin = ? AND seq IN
+           (SELECT seq FROM event WHERE twin = ? AND seq < ? ORDER BY seq LIMIT 500)""",
+        (twin, twin, seq - EVENTS),
+    ).rowcount
+    kept = Retention.of(text)
+    if not removed and last_us is not None:
+        removed = _old_samples(connection, twin, kept, last_us) or _old_residuals(connection, twin, kept, last_us)
+    removed = removed or _old_jobs(connection, twin, kept) or _old_models(connection, twin, kept)
+    return removed or _dear_residuals(connection, twin)
 
 
 def _old_samples(connection: Connection, twin: int, kept: Retention, last_us: int) -> int:
