@@ -179,7 +179,7 @@ def _read(
 ) -> "Imported":
     file, text = next(iter(texts.items()))
     if kind == "xija":
-        from twin_core.interchange.xija import read_xija
+        from twin_core.interchange.xija.specification import read_xija
 
         try:
             values = {name: float(value) for name, value in constants.items()}

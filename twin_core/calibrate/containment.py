@@ -16,6 +16,7 @@ NO_DEADLINE = float("inf")
 T = TypeVar("T")
 
 _limit: ContextVar[float] = ContextVar("limit", default=NO_DEADLINE)
+_cpu_limit: ContextVar[float] = ContextVar("cpu_limit", default=NO_DEADLINE)
 
 
 class TimeIsUpError(Exception):
@@ -23,18 +24,28 @@ class TimeIsUpError(Exception):
 
 
 @contextmanager
-def limited(deadline: float) -> Iterator[None]:
-    """Let :func:`check_time` raise in this thread from ``deadline`` on, on the clock of ``time.monotonic``."""
+def limited(deadline: float, cpu_s: float = NO_DEADLINE) -> Iterator[None]:
+    """Let :func:`check_time` raise in this thread from ``deadline`` on, or after some computing; a limit never extends another.
+
+    Parameters
+    ----------
+    deadline
+        On the clock of ``time.monotonic``.
+    cpu_s
+        Seconds that this thread may compute: unlike a deadline, the same work on a busy machine.
+    """
     token = _limit.set(min(deadline, _limit.get()))
+    cpu_token = _cpu_limit.set(min(time.thread_time() + cpu_s, _cpu_limit.get()))
     try:
         yield
     finally:
         _limit.reset(token)
+        _cpu_limit.reset(cpu_token)
 
 
 def check_time() -> None:
     """Raise TimeIsUpError where the time that :func:`limited` leaves is over; iterations call it once each."""
-    if is_late(_limit.get()):
+    if is_late(_limit.get()) or time.thread_time() >= _cpu_limit.get():
         raise TimeIsUpError("the time is up")
 
 

@@ -51,10 +51,13 @@ def explained(model: CalibratedModel, calibration: Calibration, *, deadline: flo
     misfit = float(np.sqrt(np.nanmean(np.concatenate(calibration.residuals) ** 2 / problem.noise_K**2)))
     if not is_odd(parameters, guesses, misfit):
         return model
-    found, complete = suspicions(declared_of(problem), parameters.as_dict(), deadline=deadline)
+    looked = suspicions(declared_of(problem), parameters.as_dict(), deadline=deadline)
     told = model.summary["words"]
-    words = [*told, *close_words(parameters, guesses, misfit, found, told, complete=complete)]
-    return replace(model, summary={**model.summary, "words": words, "suspicions": [s.to_json() for s in found]})
+    added = close_words(
+        parameters, guesses, misfit, looked.found, told, complete=looked.complete, left_out=looked.left_out
+    )
+    words = [*told, *added]
+    return replace(model, summary={**model.summary, "words": words, "suspicions": [s.to_json() for s in looked.found]})
 
 
 def _advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: float) -> str:
@@ -62,5 +65,6 @@ def _advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: fl
     seen = [screened(spec, record) for record in records]
     network = build_network(spec, table_knots=table_levels(spec, seen))
     problem = build_problem(network, seen, sensor_noise_K(spec, seen))
-    found, _ = suspicions(declared_of(problem), deadline=deadline)
-    return "; ".join([error, *(f"perhaps {s.words}" for s in found)])
+    looked = suspicions(declared_of(problem), deadline=deadline)
+    told = [error, *(f"perhaps {s.words}" for s in looked.found), looked.left_out]
+    return "; ".join(line for line in told if line)

@@ -6,17 +6,18 @@ the declaration or of the record that is fitted again, coarsely. What it gains i
 their noise, guesses come back to, less half a logarithm for a parameter that it adds (Schwarz 1978).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, zip_longest
 from typing import Any
 
 import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.approach import approach, thinned
-from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
+from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.calibrate.identifiability import gone_far, how_far
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem, build_problem
@@ -39,7 +40,14 @@ LEAST_GAIN_NATS = 5.0
 
 MOST_TOLD, MOST_TRIED = 3, 100
 SAMPLES = 250
-"""Records are thinned to about so many samples: a mistake shows in any of them."""
+"""Records are thinned to about so many samples, to twice as many at most: a mistake shows in any of them."""
+
+SHORTEST = 10
+"""Samples of a thinned record, at least."""
+
+FIRST_CPU_S, CLOSER_CPU_S = 12.0, 8.0
+"""Computing time of the first look at all suspicions together, and of the closer one. What a fit costs grows with the cube
+of the network, and the number of suspicions with its square: only a limit bounds their product."""
 
 FEWEST_INDEPENDENT = 10.0
 """A misfit that lasts as long as the record still counts as so many readings per sensor."""
@@ -111,32 +119,71 @@ class Declared:
 
 @dataclass(frozen=True)
 class Variant:
-    """A declaration with one mistake undone; ``released`` names the parameters that are no longer held."""
+    """A declaration with one mistake undone, made when it is asked for; ``released`` names what is no longer held."""
 
     mistake: str
     where: tuple[str, ...]
     words: str
-    declared: Declared
+    undone: Callable[[], Declared]
     released: str = ""
     added: int = 0
 
 
+@dataclass(frozen=True)
+class Looked:
+    """What came of a look at the possible mistakes.
+
+    Attributes
+    ----------
+    found
+        Those that would explain the fit, the most telling first.
+    tried, possible
+        How many were fitted, and how many there are in such a declaration.
+    complete
+        Whether nothing was left out: neither a mistake, nor the closer look at one that had come first.
+    """
+
+    found: list[Suspicion]
+    tried: int
+    possible: int
+    complete: bool
+
+    @property
+    def left_out(self) -> str:
+        """What was not looked at, in words; empty where everything was."""
+        if self.complete:
+            return ""
+        if self.tried < self.possible:
+            return f"of {self.possible:,} possible mistakes of the declaration {self.tried:,} were looked at, not the others"
+        return "not every mistake that might explain the fit was looked at closely"
+
+
 def declared_of(problem: Problem) -> Declared:
-    """Return what a calibration was made from, thinned."""
+    """Return what a calibration was made from, thinned; of many records the longest."""
     spec, records = problem.network.spec, [segment.record for segment in problem.segments]
     stride = max(1, sum(r.time_s.size for r in records) // SAMPLES)
-    stride = min(stride, max(1, min(r.time_s.size for r in records) // 10))
-    thin = tuple(thinned(spec, record, stride) for record in records) if stride > 1 else tuple(records)
+    stride = min(stride, max(1, max(r.time_s.size for r in records) // SHORTEST))
+    kept: list[Record] = []
+    samples = 0
+    for record in sorted(records, key=lambda r: -r.time_s.size):
+        size = record.time_s.size // stride
+        if kept and (size < SHORTEST or samples + size > 2 * SAMPLES):
+            break
+        kept.append(record)
+        samples += size
+    in_order = [record for record in records if any(record is one for one in kept)]
+    thin = tuple(thinned(spec, record, stride) if stride > 1 else record for record in in_order)
     return Declared(spec, thin, problem.noise_K, dict(problem.network.layout.table_knots))
 
 
-def variants(declared: Declared) -> Iterator[Variant]:
-    """Yield the declarations with one common mistake undone each, the commonest first."""
-    yield from _powers(declared)
-    yield from _temperature_units(declared)
-    yield from _swaps(declared)
-    yield from _held(declared)
-    yield from _couplings(declared)
+def variants(declared: Declared) -> list[Variant]:
+    """Return the declarations with one common mistake undone each, those first that are common and few.
+
+    Swapped pairs, held values and couplings take turns: of a large network none of them is left out altogether.
+    """
+    many: Iterable[Sequence[Variant | None]] = zip_longest(_swaps(declared), _held(declared), _couplings(declared))
+    turns = [one for turn in many for one in turn if one is not None]
+    return [*_temperature_units(declared), *_powers(declared), *turns]
 
 
 def _changed(declared: Declared, columns: dict[str, Any]) -> Declared:
@@ -159,7 +206,7 @@ def _powers(declared: Declared) -> Iterator[Variant]:
             (1.0 / THOUSAND, "unit", f"power channel '{name}' is a thousandth of what is recorded (mW read as W?)"),
         ):
             scaled = {name: lambda r, name=name, factor=factor: factor * r.values[name]}
-            yield Variant(mistake, (name,), words, _changed(declared, scaled))
+            yield Variant(mistake, (name,), words, partial(_changed, declared, scaled))
 
 
 def _temperature_units(declared: Declared) -> Iterator[Variant]:
@@ -170,10 +217,12 @@ def _temperature_units(declared: Declared) -> Iterator[Variant]:
         odd = [n for n in names if _earthly(declared, n, shift_K) and not _earthly(declared, n, 0.0)]
         shifted = {n: lambda r, n=n, shift_K=shift_K: r.values[n] + shift_K for n in odd}
         for n in odd:
-            yield Variant("unit", (n,), f"channel '{n}' {words}", _changed(declared, {n: shifted[n]}))
+            yield Variant("unit", (n,), f"channel '{n}' {words}", partial(_changed, declared, {n: shifted[n]}))
         if len(odd) > 1:
             listed = ", ".join(f"'{n}'" for n in odd)
-            yield Variant("unit", tuple(odd), f"each of channels {listed} {words}", _changed(declared, shifted))
+            yield Variant(
+                "unit", tuple(odd), f"each of channels {listed} {words}", partial(_changed, declared, shifted)
+            )
 
 
 def _earthly(declared: Declared, name: str, shift_K: float) -> bool:
@@ -187,7 +236,9 @@ def _swaps(declared: Declared) -> Iterator[Variant]:
     for kind, mistake, names in (("sensors", "swapped sensors", spec.sensors), ("loads", "swapped loads", loads)):
         for a, b in combinations([n for n in names if _recorded(declared, n)], 2):
             exchanged = {a: lambda r, b=b: r.values[b], b: lambda r, a=a: r.values[a]}
-            yield Variant(mistake, (a, b), f"{kind} '{a}' and '{b}' are swapped", _changed(declared, exchanged))
+            yield Variant(
+                mistake, (a, b), f"{kind} '{a}' and '{b}' are swapped", partial(_changed, declared, exchanged)
+            )
 
 
 def _held(declared: Declared) -> Iterator[Variant]:
@@ -195,13 +246,13 @@ def _held(declared: Declared) -> Iterator[Variant]:
     for p in network.parameters.parameters:
         if p.frozen and is_logarithmic(p.transform):
             words = f"{p.name}, held at {p.value:.3g} {p.unit}".rstrip() + ", is wrong"
-            yield Variant("held value", (p.name,), words, declared, p.name, 1)
+            yield Variant("held value", (p.name,), words, lambda: declared, p.name, 1)
     body = dump_spec(declared.spec)
     for name, boundary in declared.spec.boundaries.items():
         if boundary.value_K is not None and boundary.value_K > EARTHLY_K[0]:
             fresh = {**body, "boundaries": {**body["boundaries"], name: {"guess_K": boundary.value_K}}}
             words = f"the temperature of boundary '{name}', held at {boundary.value_K:g} K, is wrong"
-            freed = replace(declared, spec=load_spec(fresh))
+            freed = partial(_respecified, declared, fresh)
             yield Variant("held value", (f"T:{name}",), words, freed, f"T:{name}", 1)
 
 
@@ -215,7 +266,12 @@ def _couplings(declared: Declared) -> Iterator[Variant]:
             continue
         fresh = {**body, "conductors": [*body.get("conductors", []), {"between": [a, b]}]}
         words = f"a coupling between '{a}' and '{b}' is missing"
-        yield Variant("missing coupling", (a, b), words, replace(declared, spec=load_spec(fresh)), f"G:{a}|{b}", 1)
+        joined_up = partial(_respecified, declared, fresh)
+        yield Variant("missing coupling", (a, b), words, joined_up, f"G:{a}|{b}", 1)
+
+
+def _respecified(declared: Declared, body: Json) -> Declared:
+    return replace(declared, spec=load_spec(body))
 
 
 @dataclass(frozen=True)
@@ -243,7 +299,7 @@ def _fitted(
     variant: Variant, values: dict[str, float], independent: FloatArray | None, rounds: int = ROUNDS
 ) -> _Trial | None:
     """Return the best of coarse fits: from the balance at the guesses, and from given values if any."""
-    problem = variant.declared.problem()
+    problem = variant.undone().problem()
     network = problem.network
     if variant.released in network.parameters.index:
         network = _released(network, variant.released)
@@ -293,10 +349,10 @@ def _independent(problem: Problem, optimum: Optimum) -> FloatArray:
     return np.array(counts)
 
 
-def suspicions(
-    declared: Declared, values: dict[str, float] | None = None, *, deadline: float = NO_DEADLINE
-) -> tuple[list[Suspicion], bool]:
-    """Return the mistakes that would explain a poor fit, the most telling first, and whether all have been tried.
+def suspicions(declared: Declared, values: dict[str, float] | None = None, *, deadline: float = NO_DEADLINE) -> Looked:
+    """Return the mistakes that would explain a poor fit, and how many of those possible have been looked at.
+
+    A look takes :data:`FIRST_CPU_S` of computing, a closer one at the best :data:`CLOSER_CPU_S`, whatever the network.
 
     Parameters
     ----------
@@ -307,31 +363,32 @@ def suspicions(
     deadline
         On the clock of ``time.monotonic``: no suspicion is tried afterwards.
     """
-    plain = Variant("", (), "", declared)
-    base = None if values is None else attempted(partial(_fitted, plain, values, None), "as declared", [])
-    independent = None if base is None else _independent(base.problem, base.optimum)
-    cost = np.inf if base is None else base.score
+    possible = variants(declared)
+    base, independent, cost, tried, complete = None, None, np.inf, 0, False
     looked: list[tuple[float, Variant]] = []
-    complete = True
-    for tried, variant in enumerate(variants(declared)):
-        if tried >= MOST_TRIED or is_late(deadline):
-            complete = False
-            break
-        first = attempted(partial(_fitted, variant, {}, independent, QUICK_ROUNDS), variant.words, [])
-        if first is not None:
-            looked.append((first.score, variant))
-    looked.sort(key=lambda item: item[0])
     found: list[Suspicion] = []
-    for _, variant in looked[:MOST_CLOSE]:
-        if found and is_late(deadline):
-            complete = False
-            break
-        trial = attempted(partial(_fitted, variant, values or {}, independent), variant.words, [])
-        if trial is None or not cost - trial.score > LEAST_GAIN_NATS:
-            continue
-        gain = cost - trial.score if np.isfinite(cost) else -trial.score
-        found.append(Suspicion(variant.mistake, variant.where, _told(variant, trial), trial.misfit, gain))
-    return sorted(found, key=lambda s: -s.gain_nats)[:MOST_TOLD], complete
+    with suppress(TimeIsUpError), limited(deadline, FIRST_CPU_S):
+        if values is not None:
+            base = attempted(partial(_fitted, Variant("", (), "", lambda: declared), values, None), "as declared", [])
+        if base is not None:
+            independent, cost = _independent(base.problem, base.optimum), base.score
+        for variant in possible[:MOST_TRIED]:
+            check_time()
+            first = attempted(partial(_fitted, variant, {}, independent, QUICK_ROUNDS), variant.words, [])
+            tried += 1
+            if first is not None:
+                looked.append((first.score, variant))
+    looked.sort(key=lambda item: item[0])
+    with suppress(TimeIsUpError), limited(deadline, CLOSER_CPU_S):
+        for _, variant in looked[:MOST_CLOSE]:
+            check_time()
+            trial = attempted(partial(_fitted, variant, values or {}, independent), variant.words, [])
+            if trial is None or not cost - trial.score > LEAST_GAIN_NATS:
+                continue
+            gain = cost - trial.score if np.isfinite(cost) else -trial.score
+            found.append(Suspicion(variant.mistake, variant.where, _told(variant, trial), trial.misfit, gain))
+        complete = tried == len(possible)
+    return Looked(sorted(found, key=lambda s: -s.gain_nats)[:MOST_TOLD], tried, len(possible), complete)
 
 
 def _told(variant: Variant, trial: _Trial) -> str:
@@ -350,6 +407,7 @@ def close_words(
     told: Sequence[str] = (),
     *,
     complete: bool = True,
+    left_out: str = "",
 ) -> list[str]:
     """Return what is odd about a fit, and what that usually means, most telling first.
 
@@ -367,6 +425,8 @@ def close_words(
         What has been said already.
     complete
         Whether all suspicions have been tried.
+    left_out
+        What was not looked at, in words.
     """
     far = [p for p in gone_far(parameters, guesses) if not any(f" {p.name};" in line for line in told)]
     said = [f"{p.name} ended {how_far(p, guesses[p.name])}" for p in far]
@@ -378,7 +438,7 @@ def close_words(
             "no single wrong unit, sign, swapped pair, held value or missing coupling explains it: physics is missing, or"
             " several things are wrong at once"
         )
-    return said
+    return [*said, left_out] if left_out else said
 
 
 def _what_it_would_mend(suspicion: Suspicion, misfit: float) -> str:

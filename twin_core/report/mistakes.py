@@ -1,7 +1,5 @@
 """Mistakes of the declaration that would explain what a closed loop leaves unexplained, or how far its parameters went."""
 
-import time
-
 import numpy as np
 
 from twin_core._typing import Json
@@ -9,9 +7,6 @@ from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.second_order import stated_guesses
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.discover.judge import Search
-
-LONGEST_S = 30.0
-"""Seconds after which no further mistake is tried."""
 
 
 def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE) -> Json:
@@ -33,14 +28,11 @@ def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE
     if not is_odd(parameters, guesses, misfit):
         return {"suspicions": []}
     base = search.base.calibration()
-    some, complete = suspicions(
-        declared_of(base.problem),
-        base.network.parameters.as_dict(),
-        deadline=min(deadline, time.monotonic() + LONGEST_S),
-    )
-    better = [s for s in some if s.misfit < misfit or not search.findings]
-    complete = complete and not search.findings
-    words = close_words(parameters, guesses, misfit, better, report["words"], complete=complete)
+    looked = suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline)
+    better = [s for s in looked.found if s.misfit < misfit or not search.findings]
+    complete = looked.complete and not search.findings
+    told = report["words"]
+    words = close_words(parameters, guesses, misfit, better, told, complete=complete, left_out=looked.left_out)
     first = [line for line in words if line.startswith("perhaps ")]
     return {
         "suspicions": [s.to_json() for s in better],

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from copy import deepcopy
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.helpers import record_of
-from twin_core.calibrate import calibrate
-from twin_core.calibrate.suspicions import Suspicion, close_words
+from twin_core.calibrate import calibrate, suspicions
+from twin_core.calibrate.containment import TimeIsUpError, check_time, limited
+from twin_core.calibrate.problem import build_problem
+from twin_core.calibrate.suspicions import Declared, Suspicion, close_words, declared_of, variants
 from twin_core.errors import NoSolutionError
+from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.parameters.parameter import positive
 from twin_core.parameters.vector import ParameterSet
@@ -173,3 +177,89 @@ def test_words_say_how_far_each_parameter_went() -> None:
         "the misfit is 31 times the sensors' noise",
         "perhaps power channel 'H' has the wrong sign: the misfit would be 1.02 times the noise, not 31",
     ]
+
+
+def row(n: int) -> Declared:
+    """Return a row of nodes, half of whose joints are held, with a record of noise alone."""
+    names = [f"n{k}" for k in range(n)]
+    spec = {
+        "twin": "row",
+        "channels": {f"T_{name}": {"kind": "temperature", "unit": "K"} for name in names},
+        "nodes": [{"id": name, "sensor": f"T_{name}", "capacity_J_per_K": {"guess": 900.0}} for name in names],
+        "conductors": [
+            {"between": [a, b], "conductance_W_per_K": {"value" if k % 2 else "guess": 1.0}}
+            for k, (a, b) in enumerate(pairwise(names))
+        ],
+    }
+    generator = np.random.default_rng(5)
+    readings = {f"T_{name}": generator.normal(290.0, 1.0, 40) for name in names}
+    return Declared(load_spec(spec), (record_of(60.0 * np.arange(40), **readings),), np.full(n, 0.1))
+
+
+@pytest.mark.parametrize("n", [6, 40])
+def test_what_suspicions_cost_does_not_follow_the_network(n: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fits that compute a second each on a clock of the test: as many on any network, and the words say how many not."""
+    clock_s, fits = [0.0], []
+    monkeypatch.setattr("time.thread_time", lambda: clock_s[0])
+
+    def slow(variant: suspicions.Variant, *_: object) -> None:
+        fits.append(variant.mistake)
+        clock_s[0] += 1.0
+
+    monkeypatch.setattr(suspicions, "_fitted", slow)
+    declared = row(n)
+    looked = suspicions.suspicions(declared)
+    assert len(fits) == looked.tried == suspicions.FIRST_CPU_S
+    pairs, joints = n * (n - 1) // 2, n - 1
+    assert (
+        looked.possible == 2 * pairs - joints + joints // 2
+    )  # swaps, couplings that are missing, joints that are held
+    assert set(fits) == {"swapped sensors", "missing coupling", "held value"}
+    assert not looked.complete and f"{looked.possible:,}" in looked.left_out and " 12 " in looked.left_out
+    assert close_words(ParameterSet(()), {}, 9.0, [], complete=False, left_out=looked.left_out)[-1] == looked.left_out
+
+
+def test_a_fit_that_outlasts_the_limit_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the fit as declared there is nothing to compare with, and nothing is told."""
+    clock_s = [0.0]
+    monkeypatch.setattr("time.thread_time", lambda: clock_s[0])
+
+    def endless(*_: object) -> None:
+        while True:
+            clock_s[0] += 1.0
+            check_time()
+
+    monkeypatch.setattr(suspicions, "_fitted", endless)
+    looked = suspicions.suspicions(row(6), {})
+    assert looked.found == [] and looked.tried == 0 and not looked.complete
+
+
+def test_a_limit_of_computing_holds_within_a_longer_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock_s = [0.0]
+    monkeypatch.setattr("time.thread_time", lambda: clock_s[0])
+    with limited(np.inf, 2.0), limited(np.inf, 5.0):
+        check_time()
+        clock_s[0] = 2.0
+        with pytest.raises(TimeIsUpError):
+            check_time()
+    check_time()
+
+
+@pytest.mark.parametrize("lengths", [(9000,), (9000, 12), (30,) * 400, (4000, 30, 5000, 30)])
+def test_many_records_are_thinned_as_one_is(lengths: tuple[int, ...]) -> None:
+    declared = row(3)
+    rng = np.random.default_rng(1)
+    records = [
+        record_of(1e6 * k + 60.0 * np.arange(m), **{f"T_n{i}": rng.normal(290.0, 1.0, m) for i in range(3)})
+        for k, m in enumerate(lengths)
+    ]
+    thin = declared_of(build_problem(build_network(declared.spec), records, declared.noise_K, 90.0)).records
+    assert 0 < sum(r.time_s.size for r in thin) <= 2 * suspicions.SAMPLES + len(thin)
+    assert min(r.time_s.size for r in thin) >= suspicions.SHORTEST
+    starts = [r.time_s[0] for r in thin]
+    assert starts == sorted(starts)
+
+
+def test_each_possible_mistake_is_made_only_when_asked_for() -> None:
+    """Of a network of 200 nodes there are 40,000: none of them is built to be counted."""
+    assert len(variants(row(200))) == 2 * 19_900 - 199 + 99

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.errors import SpecError
-from twin_core.interchange.xija import read_xija
+from twin_core.interchange.xija.specification import read_xija
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
