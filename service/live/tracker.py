@@ -197,7 +197,9 @@ class Tracker:
         """Let the scout follow what came meanwhile."""
         self._wake.clear()
         for _ in range(SCOUTED):
-            if self._new_model:
+            if self._new_model:  # or the same one told of twice, which must not cost the look ahead
+                await self._load()
+            if self._scout is not scout:
                 return
             if not await scout.advance(self._told_seq):
                 break
