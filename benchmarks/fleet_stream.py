@@ -36,6 +36,8 @@ LANES = 8
 """Requests under way at a time."""
 LEAD_S = 30.0
 """From the start of the services to the first sample."""
+BYTES = 8 * (N_NODES + N_LOADS + 3) + 4 * (2 * N_NODES + 1) + 2 * 8
+"""Of a sample its values, instant, reception and number; of its residuals values, deviations and NIS in single precision, too."""
 ATTEMPTS = 20
 LEAST = 3
 """Samples that a spacecraft has sent before anybody asks for its forecast."""
@@ -241,6 +243,18 @@ def rows_of(told: Told, found: tuple[int, int, int, float, float], cost: Cost, d
     ]
 
 
+def sizes(told: Told, cost: Cost) -> str:
+    """Return a table of what fleets of other sizes take that send a sample a minute, each at the cost measured here."""
+    rows = []
+    for count in (1_000, 10_000, 100_000):
+        rate = count / 60.0
+        each = rate / max(sum(told.acknowledged), 1)
+        room = f"{rate * 86_400 * BYTES / 1e9:.1f}"
+        cores = [f"{each * cost.services_s:.1f}", f"{each * cost.database_s:.1f}"]
+        rows.append([f"{count:,}", f"{rate:,.0f}", *cores, room])
+    return markdown_table(["spacecraft", "samples/s", "cores of services", "cores of the database", "GB a day"], rows)
+
+
 def main() -> None:
     """Stream, verify and write the table."""
     parser = argparse.ArgumentParser()
@@ -286,6 +300,11 @@ def main() -> None:
             "the state behind it is compared with the newest sample acknowledged before it was asked for."
         )
         save_table("fleet_stream", "A thousand spacecraft, streaming", table, "benchmarks.fleet_stream", note)
+        note = (
+            "One sample of twelve channels a minute from each, at the processor time per sample of fleet_stream.md (the start of "
+            f"the processes included) and {BYTES} bytes of samples and residuals."
+        )
+        save_table("fleet_sizes", "Sizes of fleets, on paper", sizes(told, cost), "benchmarks.fleet_stream", note)
 
 
 if __name__ == "__main__":
