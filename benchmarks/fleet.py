@@ -45,14 +45,14 @@ def specification(name: str) -> dict[str, Any]:
     }
 
 
-def batches(count: int, n_twins: int, seed: int = 0) -> list[tuple[int, Batch]]:
-    """Return batches as (twin, batch), in turn, each of ROWS new samples."""
-    generator = np.random.default_rng(seed)
+def batches(count: int, n_twins: int, rows: int = ROWS) -> list[tuple[int, Batch]]:
+    """Return batches as (twin, batch), in turn, each of so many new samples."""
+    generator = np.random.default_rng(0)
     made = []
     for number in range(count):
-        first = number // n_twins * ROWS
-        time_us = (first + np.arange(ROWS, dtype=np.int64)) * 1_000_000
-        made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, ROWS)), time_us)))
+        first = number // n_twins * rows
+        time_us = (first + np.arange(rows, dtype=np.int64)) * 1_000_000
+        made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, rows)), time_us)))
     return made
 
 
@@ -70,11 +70,14 @@ def through_the_store(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
         done.acquire()
     elapsed_s = time.perf_counter() - begun
     database.close()
-    return len(work) * ROWS / elapsed_s
+    return sum(batch.time_us.size for _, batch in work) / elapsed_s
 
 
-def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int) -> float:
-    """Return samples per second of COPY into a stage and one INSERT ... SELECT, into the same table, as many batches a commit."""
+def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int, table: str = "chunk") -> float:
+    """Return samples per second of COPY into a stage and one INSERT ... SELECT, as many batches a commit as the store.
+
+    It is less than the store does: heads do not move, numbers are not handed out, and only a whole batch is known again.
+    """
     database = Database(url)
     for k in range(n_twins):
         database.submit(twins.register, f"r{k}", specification(f"r{k}")).result()
@@ -91,17 +94,18 @@ def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
                 with connection.cursor().copy("COPY stage FROM STDIN (FORMAT BINARY)") as copy:
                     copy.set_types(["int8", "int4", "int8", "int8", "int8", "bytea", "bytea", "bytea", "bytea"])
                     for twin, batch in work[start : start + 256]:
-                        seq = np.arange(ROWS, dtype="<i8").tobytes()
+                        n = int(batch.time_us.size)
+                        seq = np.arange(n, dtype="<i8").tobytes()
                         time_us = batch.time_us.tobytes()
                         ends = int(batch.time_us[0]), int(batch.time_us[-1])
-                        row = (keys[twin - 1], ROWS, *ends, ROWS, seq, time_us, batch.values.tobytes(), time_us)
+                        row = (keys[twin - 1], n, *ends, n, seq, time_us, batch.values.tobytes(), time_us)
                         copy.write_row(row)
                 connection.execute(
-                    """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
-                       SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM chunk WHERE chunk.twin = stage.twin
-                       AND chunk.first_us = stage.first_us AND chunk.last_us = stage.last_us)"""
+                    f"""INSERT INTO {table} (twin, n, first_us, last_us, last_seq, seq, time, value, received)
+                        SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM {table} AS held WHERE held.twin = stage.twin
+                        AND held.first_us = stage.first_us AND held.last_us = stage.last_us)"""  # type: ignore[arg-type]
                 )
-        return len(work) * ROWS / (time.perf_counter() - begun)
+        return sum(batch.time_us.size for _, batch in work) / (time.perf_counter() - begun)
 
 
 def claims(url: str, count: int) -> tuple[float, float]:
