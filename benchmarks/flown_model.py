@@ -150,7 +150,7 @@ def loop_row(data: Path, deadline_s: float) -> tuple[list[str], str]:
     before, after = (f"{loop.report[when]['rmse_K']:.2f}" for when in ("before", "after"))
     said = "; ".join(sentence(finding) for finding in loop.report["findings"]) or "nothing"
     ended = any("the deadline ended the search" in notice for notice in loop.report["notices"])
-    time = f"had {deadline_s:g} s, which " + ("ended it early" if ended else "it did not use up")
+    time = f"had {deadline_s:g} s, which " + ("cut it short" if ended else "it did not use up")
     return ["as it flew", before, after, loop.report["verdict"], said], time
 
 
