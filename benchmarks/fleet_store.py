@@ -8,7 +8,7 @@ what retention costs when it deletes segments and when it drops partitions. ``py
 import contextlib
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import psycopg
@@ -46,21 +46,29 @@ def partitioned(server: Server, span_us: int, count: int) -> None:
         server.execute(f"CREATE TABLE part_{k} PARTITION OF part FOR VALUES {ends}")  # type: ignore[arg-type]
 
 
-def ingest(server_url: str, rows: int, count: int) -> tuple[float, float, float]:
-    """Return samples per second of the store, of COPY and INSERT … SELECT, and of the same into partitions; best of ROUNDS."""
-    work, best = batches(count, 50, rows), (0.0, 0.0, 0.0)
+@contextlib.contextmanager
+def one_by_one() -> Iterator[None]:
+    """Let the store insert every batch by itself, as it does with large ones."""
+    usual, samples.STAGED_BYTES = samples.STAGED_BYTES, 0
+    yield
+    samples.STAGED_BYTES = usual
+
+
+def ingest(server_url: str, rows: int, count: int) -> list[float]:
+    """Return samples per second, the best of ROUNDS: the store, its batches one by one, COPY and merge, that into partitions."""
+    work, rounds = batches(count, 50, rows), []
     for _ in range(ROUNDS):
-        with fresh_database(server_url) as one, fresh_database(server_url) as two, fresh_database(server_url) as three:
-            Database(three).close()
-            with psycopg.connect(three, autocommit=True) as server:
+        with contextlib.ExitStack() as stack:
+            first, second, third, fourth = (stack.enter_context(fresh_database(server_url)) for _ in range(4))
+            Database(fourth).close()
+            with psycopg.connect(fourth, autocommit=True) as server:
                 partitioned(server, 3_600_000_000, 24)
-            found = (
-                through_the_store(one, work, 50),
-                copied_and_merged(two, work, 50),
-                copied_and_merged(three, work, 50, "part"),
-            )
-        best = tuple(map(max, best, found))  # type: ignore[assignment]
-    return best
+            found = [through_the_store(first, work, 50)]
+            with one_by_one():
+                found.append(through_the_store(second, work, 50))
+            found.append(copied_and_merged(third, work, 50))
+            rounds.append([*found, copied_and_merged(fourth, work, 50, "part")])
+    return [max(column) for column in zip(*rounds, strict=True)]
 
 
 def fill(database: Database, server: Server) -> None:
@@ -120,9 +128,9 @@ def main() -> None:
     with contextlib.ExitStack() as stack:
         url = os.environ.get("TWIN_TEST_POSTGRES_URL") or stack.enter_context(own_server("fsync=on")).url
         for n, count in SHAPES:
-            ours, copied, parted = ingest(url, n, count)
+            ours, alone, copied, parted = ingest(url, n, count)
             found = (
-                f"{ours:,.0f} samples/s",
+                f"{ours:,.0f} samples/s; one by one {alone:,.0f}",
                 f"{copied:,.0f} ({copied / ours:.2f})",
                 f"{parted:,.0f} ({parted / ours:.2f})",
             )
