@@ -94,8 +94,8 @@ def import_model(
     if over_time and kind != "sinda":
         raise click.UsageError("--over-time belongs to SINDA decks; other tools' arrays over time are always read")
     found = _read(kind, texts, columns, values, hidden, held, spread, over_time)
-    refused = list(found.refused)
-    if not found.data.get("nodes"):
+    refused = list(dict.fromkeys(found.refused))  # a line of a loop is refused each time that it is unrolled
+    if not found.data.get("nodes") and (kind == "sinda" or skip_unknown or not refused):
         raise SpecError(_without_nodes(kind, files))
     if refused and not skip_unknown:
         raise SpecError(
