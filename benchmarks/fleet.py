@@ -22,7 +22,7 @@ import numpy as np
 import psycopg
 
 from benchmarks.markdown import markdown_table, save_table
-from service.store import jobs, samples, twins
+from service.store import jobs, ownership, samples, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -216,6 +216,34 @@ def takeover_s(url: str, folder: Path) -> float:
         return time.perf_counter() - begun
 
 
+def look_ms(url: str, count: int) -> float:
+    """Return how long the look for changes takes that every process takes once a second, over so many twins."""
+    database = Database(url)
+
+    def fill(connection: Connection) -> None:
+        connection.execute(
+            """INSERT INTO twin (name, specification, created_us)
+               SELECT 's' || k, '{}', 0 FROM generate_series(1, CAST(? AS BIGINT)) AS k""",
+            (count,),
+        )
+        connection.execute("INSERT INTO head (twin) SELECT id FROM twin")
+        connection.execute(
+            """INSERT INTO model (twin, version, created_us, source, summary, document)
+               SELECT id, 1, 0, 'manual', '{}', '{}' FROM twin"""
+        )
+        connection.execute("INSERT INTO activation (twin, version, at_us, reason) SELECT id, 1, 0, '' FROM twin")
+        connection.execute("ANALYZE")
+
+    database.submit(fill).result()
+    took = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        assert len(database.engine.read(ownership.changes)) == count
+        took.append(time.perf_counter() - begun)
+    database.close()
+    return 1e3 * float(np.median(took))
+
+
 def main() -> None:
     """Measure and write the table."""
     parser = argparse.ArgumentParser()
@@ -251,6 +279,11 @@ def main() -> None:
             f"bare SKIP LOCKED loop {bare:,.0f}/s",
             f"{100 * ours / bare:.0f} %",
         )
+        for count in (10_000, 100_000):
+            with fresh_database(url) as database:
+                tell(
+                    f"look for changes, {count:,} twins", f"{look_ms(database, count):,.0f} ms", "each process, each s"
+                )
         times = []
         for _ in range(3):
             with fresh_database(url) as database:
