@@ -102,6 +102,7 @@ bench-service: $(STAMP)
 
 bench-fleet: $(STAMP)
 	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.fleet_store
 	$(BIN)/python -m benchmarks.fleet_filter
 	$(BIN)/python -m benchmarks.family
 	$(BIN)/python -m benchmarks.sqlite_before

@@ -30,7 +30,12 @@ _SOLUTIONS = ("STEADY", "FASTIC", "STDSTL", "TRANSIENT", "FWDBCK", "FORWRD")
 
 
 def read_sinda(
-    texts: Mapping[str, str], *, channels: Mapping[str, str] | None = None, held: bool = False, over_time: bool = False
+    texts: Mapping[str, str],
+    *,
+    channels: Mapping[str, str] | None = None,
+    held: bool = False,
+    over_time: bool = False,
+    by_submodel: bool = False,
 ) -> Imported:
     """Return a deck as a specification.
 
@@ -45,6 +50,8 @@ def read_sinda(
         Take couplings as known; by default they are guesses.
     over_time
         Read the course of the heat rates over the orbit, a channel per node, instead of their averages.
+    by_submodel
+        Calibrate a factor for the couplings of each pair of submodels instead of every coupling.
     """
     reader = _Reader(over_time, Deck(twin_id(next(iter(texts)).rsplit("/", 1)[-1].split(".")[0])))
     for source in sorted(texts, key=lambda name: not name.endswith(".inp")):  # its constants come first
@@ -53,7 +60,7 @@ def read_sinda(
     reader.operate()
     for pair, line in reader.unseen.items():
         deck.refused.append(f"{line}: node '{pair}' is declared nowhere")
-    return specified(deck, channels or {}, held=held, source=next(iter(texts)))
+    return specified(deck, channels or {}, held=held, source=next(iter(texts)), by_submodel=by_submodel)
 
 
 class _Reader:

@@ -222,6 +222,17 @@ def test_every_setting_of_a_line_counts(line: str, said: str) -> None:
     assert any(r.startswith("case.inp: line 4: ") and said in r for r in refused), refused
 
 
+def test_couplings_by_submodel_share_a_factor() -> None:
+    """The same steady state as with every number known, and the factors are all that is free."""
+    deck = {name: text.replace("-BOX.3", "BOX.-3") for name, text in SINDA.items()}
+    grouped = read_sinda(deck, channels={"BOX.1": "T"}, by_submodel=True)
+    assert grouped.data["parameters"] == {name: {"guess": 1.0} for name in ("GL_BOX", "GR_BOX_SPACE", "GR_BOX")}
+    network = build_network(load_spec(grouped.data))
+    assert set(network.parameters.free_names) == {"GL_BOX", "GR_BOX_SPACE", "GR_BOX"}
+    known = solved(read_sinda(deck, channels={"BOX.1": "T"}, held=True))
+    assert solved(grouped) == pytest.approx(known, abs=1e-6)
+
+
 OPERATION = "HEADER OPERATION DATA\n{}\nHEADER OUTPUT CALLS, BOX\n      CALL TPRINT('ALL')\n"
 
 

@@ -65,6 +65,7 @@ _SIGNATURES: dict[str, tuple[str, ...]] = {
                           "dPs", "var_func", "tau", "ampl", "epoch", "dh_heater"),
     "SolarHeatOffNomRoll": ("node", "pitch_comp", "roll_comp", "eclipse_comp", "P_plus_y", "P_minus_y"),
     "PropHeater": ("node", "node_control", "k", "T_set"),
+    "ThermostatHeater": ("node", "node_control", "P", "T_set"),
     "StepFunctionPower": ("node", "time", "P", "id"),
     "MsidStatePower": ("node", "state_msid", "state_val", "P"),
     "AcisDpaStatePower": ("node", "mult", "fep_count", "ccd_count", "vid_board", "clocking", "pow_states"),

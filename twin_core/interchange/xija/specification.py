@@ -22,6 +22,9 @@ from twin_core.interchange.xija.components import (
 from twin_core.interchange.xija.draft import FITTED_SPREAD, Draft, UnknownError
 from twin_core.interchange.xija.solar import off_nominal_roll, solar, solar_by_instrument
 
+SWITCHING_BAND_K = 0.1
+"""Width over which a thermostat without a deadband switches: at its set-point it would switch at every instant."""
+
 _POWER_STATES = ("0xxx", "1xxx", "2xxx", "3xx0", "3xx1", "4xxx", "5xxx", "66x0", "6611", "6xxx")
 
 
@@ -179,15 +182,24 @@ def _heat_sink(write: Draft, component: Component) -> None:
     write.conductors.append({"between": [name_of(node), name], "conductance_W_per_K": conductance})
 
 
-def _proportional_heater(write: Draft, component: Component) -> None:
-    node = str(component.args["node"])
-    gain, set_K = component.par("k", 0.1), component.par("T_set", 20.0) + ZERO_CELSIUS_K
-    if gain == 0.0:
-        write.notes.append(f"{write.at(component)}: k is 0 and left out")
+def _heater(write: Draft, component: Component) -> None:
+    """A proportional heater; a thermostat without a deadband as one that goes from all to nothing within a narrow band."""
+    node, set_K = str(component.args["node"]), component.par("T_set", 20.0) + ZERO_CELSIUS_K
+    par = "k" if component.kind == "PropHeater" else "P"
+    amount = component.par(par, 0.1)
+    if amount == 0.0:
+        write.notes.append(f"{write.at(component)}: {par} is 0 and left out")
         return
     if component.free & {"T_set"}:
         write.notes.append(f"{write.at(component)}: T_set is held, not calibrated")
-    law = {"set_K": number(set_K), "gain_W_per_K": write.quantity(component, write.scale[node] * gain, "k")}
+    heat = write.quantity(component, write.scale[node] * amount, par)
+    law: Data = {"set_K": number(set_K), "gain_W_per_K": heat}
+    if par == "P":
+        gain = {"value": number(write.scale[node] * amount / SWITCHING_BAND_K)}
+        law = {"set_K": number(set_K + 0.5 * SWITCHING_BAND_K), "gain_W_per_K": gain, "most_W": heat}
+        write.notes.append(
+            f"{write.at(component)} has no deadband: it goes from P to nothing within {SWITCHING_BAND_K:g} K about T_set"
+        )
     heater: Data = {"node": name_of(node), "proportional": law}
     if control := component.args.get("node_control"):
         heater["control"] = name_of(str(control))
@@ -257,7 +269,7 @@ _TRANSLATORS: dict[str, Callable[[Draft, Component], None]] = {
     ),
     **dict.fromkeys(INSTRUMENTS, solar_by_instrument),
     "SolarHeatOffNomRoll": off_nominal_roll,
-    "PropHeater": _proportional_heater,
+    **dict.fromkeys(("PropHeater", "ThermostatHeater"), _heater),
     "StepFunctionPower": _step_power,
     "MsidStatePower": _state_power,
     "AcisDpaStatePower": _electronics,
