@@ -8,7 +8,7 @@ GROUND := $(VENV)/.ground
 DOCS := $(VENV)/.docs
 SOAK_MINUTES ?= 60
 
-.PHONY: demo test test-fast test-ground test-fleet test-postgres check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
+.PHONY: demo test test-fast test-long test-ground test-fleet test-postgres check docs bench bench-measured bench-paper-a bench-paper-b bench-loop bench-ablation bench-decoys bench-experiments bench-sufficiency bench-service bench-fleet serve clean
 
 $(STAMP): pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
@@ -35,13 +35,18 @@ demo: $(STAMP)
 	$(BIN)/twin demo --out demo-out
 
 # Two processes, file by file: what a file sets up is set up once, and the long ones do not come last.
-PYTEST := $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+# Python keeps its bytecode: the tests start hundreds of processes, each of which would compile the sources again.
+PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
-	$(PYTEST) -m "not ground and not fleet"
+	$(PYTEST) -m "not long and not ground and not fleet"
+
+# The demonstration, the quick start and the operator's guide, as they are printed.
+test-long: $(STAMP)
+	$(PYTEST) -m long
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow and not e2e and not browser and not ground and not fleet"
+	$(PYTEST) -m "not slow and not long and not e2e and not browser and not ground and not fleet"
 
 # Several processes on PostgreSQL, and their faults.
 test-fleet: $(STAMP)
@@ -49,7 +54,7 @@ test-fleet: $(STAMP)
 
 # On PostgreSQL every test of the service that starts no process of its own.
 test-postgres: $(STAMP)
-	TWIN_TEST_STORE=postgres $(PYTEST) -m "not fleet and not e2e and not browser and not ground" tests/service
+	TWIN_TEST_STORE=postgres $(PYTEST) -m "not fleet and not long and not e2e and not browser and not ground" tests/service
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
@@ -97,6 +102,7 @@ bench-service: $(STAMP)
 
 bench-fleet: $(STAMP)
 	$(BIN)/python -m benchmarks.fleet
+	$(BIN)/python -m benchmarks.fleet_store
 	$(BIN)/python -m benchmarks.fleet_filter
 	$(BIN)/python -m benchmarks.family
 	$(BIN)/python -m benchmarks.sqlite_before

@@ -22,7 +22,7 @@ import numpy as np
 import psycopg
 
 from benchmarks.markdown import markdown_table, save_table
-from service.store import jobs, samples, twins
+from service.store import jobs, ownership, samples, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -45,14 +45,14 @@ def specification(name: str) -> dict[str, Any]:
     }
 
 
-def batches(count: int, n_twins: int, seed: int = 0) -> list[tuple[int, Batch]]:
-    """Return batches as (twin, batch), in turn, each of ROWS new samples."""
-    generator = np.random.default_rng(seed)
+def batches(count: int, n_twins: int, rows: int = ROWS) -> list[tuple[int, Batch]]:
+    """Return batches as (twin, batch), in turn, each of so many new samples."""
+    generator = np.random.default_rng(0)
     made = []
     for number in range(count):
-        first = number // n_twins * ROWS
-        time_us = (first + np.arange(ROWS, dtype=np.int64)) * 1_000_000
-        made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, ROWS)), time_us)))
+        first = number // n_twins * rows
+        time_us = (first + np.arange(rows, dtype=np.int64)) * 1_000_000
+        made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, rows)), time_us)))
     return made
 
 
@@ -70,11 +70,14 @@ def through_the_store(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
         done.acquire()
     elapsed_s = time.perf_counter() - begun
     database.close()
-    return len(work) * ROWS / elapsed_s
+    return sum(batch.time_us.size for _, batch in work) / elapsed_s
 
 
-def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int) -> float:
-    """Return samples per second of COPY into a stage and one INSERT ... SELECT, into the same table, as many batches a commit."""
+def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int, table: str = "chunk") -> float:
+    """Return samples per second of COPY into a stage and one INSERT ... SELECT, as many batches a commit as the store.
+
+    It is less than the store does: heads do not move, numbers are not handed out, and only a whole batch is known again.
+    """
     database = Database(url)
     for k in range(n_twins):
         database.submit(twins.register, f"r{k}", specification(f"r{k}")).result()
@@ -91,17 +94,18 @@ def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
                 with connection.cursor().copy("COPY stage FROM STDIN (FORMAT BINARY)") as copy:
                     copy.set_types(["int8", "int4", "int8", "int8", "int8", "bytea", "bytea", "bytea", "bytea"])
                     for twin, batch in work[start : start + 256]:
-                        seq = np.arange(ROWS, dtype="<i8").tobytes()
+                        n = int(batch.time_us.size)
+                        seq = np.arange(n, dtype="<i8").tobytes()
                         time_us = batch.time_us.tobytes()
                         ends = int(batch.time_us[0]), int(batch.time_us[-1])
-                        row = (keys[twin - 1], ROWS, *ends, ROWS, seq, time_us, batch.values.tobytes(), time_us)
+                        row = (keys[twin - 1], n, *ends, n, seq, time_us, batch.values.tobytes(), time_us)
                         copy.write_row(row)
                 connection.execute(
-                    """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
-                       SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM chunk WHERE chunk.twin = stage.twin
-                       AND chunk.first_us = stage.first_us AND chunk.last_us = stage.last_us)"""
+                    f"""INSERT INTO {table} (twin, n, first_us, last_us, last_seq, seq, time, value, received)
+                        SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM {table} AS held WHERE held.twin = stage.twin
+                        AND held.first_us = stage.first_us AND held.last_us = stage.last_us)"""  # type: ignore[arg-type]
                 )
-        return len(work) * ROWS / (time.perf_counter() - begun)
+        return sum(batch.time_us.size for _, batch in work) / (time.perf_counter() - begun)
 
 
 def claims(url: str, count: int) -> tuple[float, float]:
@@ -212,6 +216,34 @@ def takeover_s(url: str, folder: Path) -> float:
         return time.perf_counter() - begun
 
 
+def look_ms(url: str, count: int) -> float:
+    """Return how long the look for changes takes that every process takes once a second, over so many twins."""
+    database = Database(url)
+
+    def fill(connection: Connection) -> None:
+        connection.execute(
+            """INSERT INTO twin (name, specification, created_us)
+               SELECT 's' || k, '{}', 0 FROM generate_series(1, CAST(? AS BIGINT)) AS k""",
+            (count,),
+        )
+        connection.execute("INSERT INTO head (twin) SELECT id FROM twin")
+        connection.execute(
+            """INSERT INTO model (twin, version, created_us, source, summary, document)
+               SELECT id, 1, 0, 'manual', '{}', '{}' FROM twin"""
+        )
+        connection.execute("INSERT INTO activation (twin, version, at_us, reason) SELECT id, 1, 0, '' FROM twin")
+        connection.execute("ANALYZE")
+
+    database.submit(fill).result()
+    took = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        assert len(database.engine.read(ownership.changes)) == count
+        took.append(time.perf_counter() - begun)
+    database.close()
+    return 1e3 * float(np.median(took))
+
+
 def main() -> None:
     """Measure and write the table."""
     parser = argparse.ArgumentParser()
@@ -247,6 +279,11 @@ def main() -> None:
             f"bare SKIP LOCKED loop {bare:,.0f}/s",
             f"{100 * ours / bare:.0f} %",
         )
+        for count in (10_000, 100_000):
+            with fresh_database(url) as database:
+                tell(
+                    f"look for changes, {count:,} twins", f"{look_ms(database, count):,.0f} ms", "each process, each s"
+                )
         times = []
         for _ in range(3):
             with fresh_database(url) as database:

@@ -67,7 +67,8 @@ def _clock(index: "pd.Index[Any]", name: str) -> tuple[np.ndarray, int | None]:
         try:
             index = pd.DatetimeIndex(pd.to_datetime(index, utc=True, format="ISO8601"))
         except (ValueError, TypeError) as error:
-            raise TelemetryError(f"{name}: its index is neither instants nor seconds ({error})") from error
+            told = str(error).partition(". ")[0]
+            raise TelemetryError(f"{name}: its index is neither instants nor seconds ({told})") from error
     if isinstance(index, pd.DatetimeIndex):
         if index.hasnans:
             raise TelemetryError(f"{name}: an instant of its index is missing")
@@ -75,7 +76,7 @@ def _clock(index: "pd.Index[Any]", name: str) -> tuple[np.ndarray, int | None]:
         unix_ns = utc.as_unit("ns").asi8
         if unix_ns.size == 0:
             raise TelemetryError(f"{name}: holds no samples")
-        return (unix_ns - unix_ns[0]) / 1e9, int(unix_ns[0])
+        return (unix_ns - unix_ns.min()) / 1e9, int(unix_ns.min())
     if isinstance(index, pd.TimedeltaIndex):
         return np.asarray(index.total_seconds(), dtype=np.float64), None
     if not pd.api.types.is_numeric_dtype(index.dtype):

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Data: TypeAlias = Record | pd.DataFrame
-_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86_400.0}
+_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 
 
 def _records(spec: TwinSpec, data: Data | Sequence[Data]) -> list[Record]:
@@ -129,9 +129,9 @@ def seconds(duration: float | str | pd.Timedelta) -> float:
         return float(duration.total_seconds())
     if isinstance(duration, int | float):
         return float(duration)
-    if not re.fullmatch(r"(\d+(\.\d+)?(s|min|h|d))+", duration):
+    if not re.fullmatch(r"(\d+(\.\d+)?(s|min|h|d|w))+", duration):
         raise ModelError(f"'{duration}' is no duration; write seconds, or '30min', '6h', '1d'")
-    return sum(float(n) * _SECONDS[unit] for n, unit in re.findall(r"(\d+(?:\.\d+)?)(s|min|h|d)", duration))
+    return sum(float(n) * _SECONDS[unit] for n, unit in re.findall(r"(\d+(?:\.\d+)?)(s|min|h|d|w)", duration))
 
 
 def simulate(

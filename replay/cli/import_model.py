@@ -45,6 +45,9 @@ _PARTS = (".cc", ".k", ".hra")
 @click.option("--hidden", multiple=True, metavar="NODE", help="Nodes without telemetry (Xija models).")
 @click.option("--held", is_flag=True, help="Take every number as known; else what was fitted before is a guess.")
 @click.option(
+    "--by-submodel", is_flag=True, help="Calibrate a factor for the couplings of each pair of submodels (SINDA)."
+)
+@click.option(
     "--spread",
     type=click.FloatRange(min=1.0, min_open=True),
     default=1.1,
@@ -68,6 +71,7 @@ def import_model(
     constants: tuple[str, ...],
     hidden: tuple[str, ...],
     held: bool,
+    by_submodel: bool,
     spread: float,
     over_time: bool,
     inputs: Path | None,
@@ -93,9 +97,11 @@ def import_model(
     columns, values = _pairs(channels, "channel"), _pairs(constants, "constant")
     if over_time and kind != "sinda":
         raise click.UsageError("--over-time belongs to SINDA decks; other tools' arrays over time are always read")
-    found = _read(kind, texts, columns, values, hidden, held, spread, over_time)
-    refused = list(found.refused)
-    if not found.data.get("nodes"):
+    if by_submodel and (held or kind != "sinda"):
+        raise click.UsageError("--by-submodel belongs to SINDA decks, without --held")
+    found = _read(kind, texts, columns, values, hidden, held, spread, over_time, by_submodel)
+    refused = list(dict.fromkeys(found.refused))  # a line of a loop is refused each time that it is unrolled
+    if not found.data.get("nodes") and (kind == "sinda" or skip_unknown or not refused):
         raise SpecError(_without_nodes(kind, files))
     if refused and not skip_unknown:
         raise SpecError(
@@ -176,10 +182,11 @@ def _read(
     held: bool,
     spread: float,
     over_time: bool,
+    by_submodel: bool,
 ) -> "Imported":
     file, text = next(iter(texts.items()))
     if kind == "xija":
-        from twin_core.interchange.xija import read_xija
+        from twin_core.interchange.xija.specification import read_xija
 
         try:
             values = {name: float(value) for name, value in constants.items()}
@@ -194,9 +201,8 @@ def _read(
         return read_esatan(text, str(file), channels=channels, held=held)
     from twin_core.interchange.sinda import read_sinda
 
-    return read_sinda(
-        {str(name): deck for name, deck in texts.items()}, channels=channels, held=held, over_time=over_time
-    )
+    decks = {str(name): deck for name, deck in texts.items()}
+    return read_sinda(decks, channels=channels, held=held, over_time=over_time, by_submodel=by_submodel)
 
 
 def _write_inputs(out: Path, found: "Imported", duration_s: float | None) -> None:

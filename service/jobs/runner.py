@@ -196,7 +196,7 @@ class Jobs:
             twin = await self._find(held.twin)
             if twin is None:
                 raise JobCancelled
-            if held.attempt > MOST_ATTEMPTS:
+            if held.tries > MOST_ATTEMPTS:
                 raise JobFailed(f"its worker died {MOST_ATTEMPTS} times; take fewer samples, or look at the log")
             await self._work(twin, held, cancel)
             state = "succeeded"

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.instants import now_us
-from service.store import anomalies, checkpoints, events, fleet, residuals, samples
+from service.store import anomalies, checkpoints, events, fleet, models, residuals, samples
 from service.store.anomalies import AnomalyRow, Change
 from service.store.checkpoints import Checkpoint
 from service.store.connection import Connection
@@ -84,6 +84,11 @@ class Reading:
     told: NDArray[np.bool_]
     left: int
     revision: int
+
+
+def stands(connection: Connection, twin: int) -> tuple[int, int | None]:
+    """Return the last number of a twin's stream, and the version that is active; None if none is."""
+    return samples.latest_seq(connection, twin), models.active_version(connection, twin)
 
 
 def save(connection: Connection, twin: Entry, step: Step) -> tuple[None, Sequence[Stretch]]:

@@ -136,7 +136,16 @@ class Tracker:
         self.model_changed()
 
     async def settled(self, timeout_s: float) -> bool:
-        """Return whether everything stored so far is assimilated, after waiting for it a while."""
+        """Return whether everything stored when this was asked is assimilated, after waiting for it a while.
+
+        The database is asked what that is: word of a model or of samples comes after their commit, from another process later
+        still, and whoever saw the commit may ask before it comes.
+        """
+        seq, version = await self._database.read(progress.stands, self.twin.key)
+        if version != (None if self.active is None else self.active.version):
+            self.model_changed()
+        elif seq > self._told_seq and self._scout is None:  # a scout hears of samples between two blocks of the archive
+            self.arrived()
         try:
             async with asyncio.timeout(timeout_s):
                 await self._idle.wait()
@@ -188,7 +197,9 @@ class Tracker:
         """Let the scout follow what came meanwhile."""
         self._wake.clear()
         for _ in range(SCOUTED):
-            if self._new_model:
+            if self._new_model:  # or the same one told of twice, which must not cost the look ahead
+                await self._load()
+            if self._scout is not scout:
                 return
             if not await scout.advance(self._told_seq):
                 break

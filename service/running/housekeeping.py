@@ -3,7 +3,8 @@
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from functools import partial
 
 from service.errors import Refusal
 from service.fleet.ownership import Ownership
@@ -20,7 +21,6 @@ PAUSE_S = 0.01
 CHORES: tuple[tuple[str, Callable[[Connection], int]], ...] = (
     ("deleted samples that can no longer be restored", aside.expire),
     ("twins that were deleted", retention.sweep_gone),
-    ("what is older than its twin keeps", retention.sweep_old),
 )
 
 
@@ -48,20 +48,39 @@ class Housekeeping:
             self._wake.clear()
             leads = self._ownership.leads
             for what, chore in (*CHORES, *self._database.engine.chores) if leads else ():
-                try:
-                    await self._finish(what, chore)
-                except Exception as error:  # the next time may be a better one
-                    reason = error.detail if isinstance(error, Refusal) else f"{type(error).__name__}: {error}"
-                    log.warning("housekeeping was interrupted", extra={"chore": what, "reason": reason})
+                await self._finish(what, partial(self._database.write, chore))
+            if leads:
+                await self._sweep()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY_S if leads else SUCCESSION_S):
                     await self._wake.wait()
 
-    async def _finish(self, what: str, chore: Callable[[Connection], int]) -> None:
-        """Do a chore until there is nothing left to do."""
+    async def _sweep(self) -> None:
+        """Remove what is older than its twin keeps, one twin after another: only readers look at the whole fleet."""
+        try:
+            twins = await self._database.read(retention.due)
+        except Exception as error:
+            _warn("old rows", error)
+            return
+        for twin in twins:
+            await self._finish(
+                "what is older than its twin keeps",
+                partial(self._database.write_to, twin, retention.sweep_old, twin),
+            )
+
+    async def _finish(self, what: str, chore: Callable[[], Awaitable[int]]) -> None:
+        """Do a chore until there is nothing left to do, or it cannot be done: the next time may be a better one."""
         removed = 0
-        while done := await self._database.write(chore):
-            removed += done
-            await asyncio.sleep(PAUSE_S)
+        try:
+            while done := await chore():
+                removed += done
+                await asyncio.sleep(PAUSE_S)
+        except Exception as error:
+            _warn(what, error)
         if removed:
             log.info("removed for ever", extra={"what": what, "rows": removed})
+
+
+def _warn(what: str, error: Exception) -> None:
+    reason = error.detail if isinstance(error, Refusal) else f"{type(error).__name__}: {error}"
+    log.warning("housekeeping was interrupted", extra={"chore": what, "reason": reason})

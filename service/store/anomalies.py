@@ -8,6 +8,7 @@ from typing import Any
 import orjson
 
 from service.instants import format_instant
+from service.store import models
 from service.store.connection import Connection
 
 WORDS = {
@@ -166,8 +167,7 @@ def select(
     """
     start = start_us if start_us is not None else -(2**62)
     stop = stop_us if stop_us is not None else 2**62
-    row = connection.execute("SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1", (twin,))
-    active = next((number for (number,) in row), None)
+    active = models.active_version(connection, twin)
     chosen = active if version is None else version
     query = _SELECT + "WHERE twin = ? AND version = ? AND start_us < ? ORDER BY stop_us IS NULL DESC, start_us DESC, id"
     rows = [AnomalyRow(*row) for row in connection.execute(query, (twin, chosen, stop))]

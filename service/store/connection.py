@@ -5,6 +5,7 @@ id, ``ON CONFLICT`` instead of ``REPLACE``, ``CASE`` instead of a least or great
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 Row = tuple[Any, ...]
@@ -35,3 +36,23 @@ class Connection(Protocol):
 
     def executemany(self, query: str, parameters: Iterable[Sequence[Any]], /) -> Cursor:
         """Run one statement once for each row of parameters."""
+
+
+@dataclass(slots=True)
+class Head:
+    """Where the archive of a twin stands, as far as what is appended to it depends on that and changes it."""
+
+    seq: int
+    last_us: int | None
+    small_chunks: int
+    small_rows: int
+
+
+class Stage(Protocol):
+    """Where segments of a transaction wait, so that few statements store all of them; some connections have one."""
+
+    def head(self, twin: int) -> Head | None:
+        """Return where a twin stands, whose archive this transaction has locked; None where that is not known."""
+
+    def put(self, segment: Row) -> None:
+        """Store a segment that lies behind all of its twin, moving the twin's head: at the latest with the commit."""

@@ -179,6 +179,7 @@ class Database:
         session.begin(_twins(orders))
         try:
             for order in orders:
+                session.turn(order.twin)
                 order.result = order.operation(session.connection)
         except Exception as error:
             session.roll_back()

@@ -22,6 +22,9 @@ class Session(Protocol):
     def begin(self, twins: Collection[int]) -> None:
         """Begin a transaction that nobody else's write of these twins can interleave with."""
 
+    def turn(self, twin: int | None) -> None:
+        """Hear whose twin's the next statements are; None: they may concern any."""
+
     def commit(self) -> None:
         """Make it durable."""
 

@@ -94,13 +94,22 @@ def waiting(connection: Connection, twin: int) -> int:
 
 @dataclass(frozen=True)
 class Claim:
-    """A job in the hands of a worker; ``attempt`` is the token without which nothing of it is written."""
+    """A job in the hands of a worker.
+
+    Attributes
+    ----------
+    attempt
+        The token without which nothing of it is written: greater than any before.
+    tries
+        How many workers had it, this one included, without those that gave it back.
+    """
 
     job: str
     twin: int
     kind: str
     request: dict[str, Any]
     attempt: int
+    tries: int
 
 
 def claim(connection: Connection, worker: str, lease_us: int, *, is_shared: bool) -> Claim | None:
@@ -116,10 +125,13 @@ def claim(connection: Connection, worker: str, lease_us: int, *, is_shared: bool
             started_us = coalesce(started_us, ?) WHERE number = (SELECT number FROM job WHERE state = 'queued'
             OR (state = 'running' AND worker != ? AND beat_us < clock_us() - ?)
             ORDER BY number LIMIT 1 {"FOR UPDATE SKIP LOCKED" if is_shared else ""})
-            RETURNING id, twin, kind, request, attempt""",
+            RETURNING id, twin, kind, request, attempt, attempt - returned""",
         (worker, now_us(), worker, lease_us),
     ).fetchone()
-    return None if row is None else Claim(row[0], row[1], row[2], orjson.loads(row[3]), row[4])
+    if row is None:
+        return None
+    job, twin, kind, request, attempt, tries = row
+    return Claim(job, twin, kind, orjson.loads(request), attempt, tries)
 
 
 def beat(connection: Connection, worker: str) -> dict[str, tuple[int, bool]]:
@@ -159,7 +171,9 @@ def end(connection: Connection, held: Claim, state: str, message: str) -> None:
 def put_back(connection: Connection, held: Claim) -> None:
     """Let a job wait for another worker; LeaseLost if it is in other hands already."""
     hold(connection, held)
-    query = "UPDATE job SET state = 'queued', message = 'waiting for a free worker', attempt = attempt - 1 WHERE id = ?"
+    query = (
+        "UPDATE job SET state = 'queued', message = 'waiting for a free worker', returned = returned + 1 WHERE id = ?"
+    )
     connection.execute(query, (held.job,))
 
 
@@ -173,7 +187,7 @@ def finish_waiting(connection: Connection, job: str) -> None:
 def leave(connection: Connection, worker: str, *, is_shared: bool) -> None:
     """Let go of what a worker holds as it ends: others go on with it, or, where there are none, nothing waits any more."""
     if is_shared:
-        query = "UPDATE job SET state = 'queued', attempt = attempt - 1 WHERE worker = ? AND state = 'running'"
+        query = "UPDATE job SET state = 'queued', returned = returned + 1 WHERE worker = ? AND state = 'running'"
         connection.execute(query, (worker,))
     else:
         query = """UPDATE job SET state = 'cancelled', message = 'cancelled', finished_us = ?

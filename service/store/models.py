@@ -147,6 +147,13 @@ def active(connection: Connection, twin: int) -> Active | None:
     return None if row is None else Active(row[0], orjson.loads(row[1]), row[2])
 
 
+def active_version(connection: Connection, twin: int) -> int | None:
+    """Return the version of the active model, or None before the first activation."""
+    query = "SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1"
+    row = connection.execute(query, (twin,)).fetchone()
+    return None if row is None else int(row[0])
+
+
 def first_us(connection: Connection, twin: int) -> int:
     """Return the first instant of a twin's archive, where the time axis of a new model begins; 0 if it is empty."""
     row = connection.execute("SELECT first_us FROM head WHERE twin = ?", (twin,)).fetchone()

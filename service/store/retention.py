@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import orjson
 
+from service.store import models
 from service.store.connection import Connection
 from service.store.errors import Conflicting, Missing
 
@@ -70,23 +71,35 @@ def sweep_gone(connection: Connection) -> int:
     return 1
 
 
-def sweep_old(connection: Connection) -> int:
-    """Remove what a twin keeps no longer, and the messages that nobody can resume from."""
-    query = """SELECT twin.id, twin.retention, head.last_us, head.seq FROM twin JOIN head ON head.twin = twin.id"""
-    for twin, text, last_us, seq in connection.execute(query).fetchall():
-        removed = connection.execute(
-            """DELETE FROM event WHERE twin = ? AND seq IN
-               (SELECT seq FROM event WHERE twin = ? AND seq < ? ORDER BY seq LIMIT 500)""",
-            (twin, twin, seq - EVENTS),
-        ).rowcount
-        kept = Retention.of(text)
-        if not removed and last_us is not None:
-            removed = _old_samples(connection, twin, kept, last_us) or _old_residuals(connection, twin, kept, last_us)
-        removed = removed or _old_jobs(connection, twin, kept) or _old_models(connection, twin, kept)
-        removed = removed or _dear_residuals(connection, twin)
-        if removed:
-            return removed
-    return 0
+def due(connection: Connection) -> list[int]:
+    """Return the twins of which ``sweep_old`` may find something to remove: a look that a reader can take."""
+    query = """SELECT twin.id FROM twin JOIN head ON head.twin = twin.id WHERE twin.retention <> '{}'
+               OR EXISTS (SELECT 1 FROM event WHERE event.twin = twin.id AND event.seq < head.seq - ?)
+               OR EXISTS (SELECT 1 FROM residual WHERE residual.twin = twin.id AND residual.version <> coalesce(
+                  (SELECT version FROM activation WHERE activation.twin = twin.id ORDER BY id DESC LIMIT 1), 0))
+               ORDER BY twin.id"""
+    return [twin for (twin,) in connection.execute(query, (EVENTS,))]
+
+
+def sweep_old(connection: Connection, twin: int) -> int:
+    """Remove a part of what a twin keeps no longer, and of the messages that nobody can resume from."""
+    query = (
+        """SELECT twin.retention, head.last_us, head.seq FROM twin JOIN head ON head.twin = twin.id WHERE twin.id = ?"""
+    )
+    row = connection.execute(query, (twin,)).fetchone()
+    if row is None:
+        return 0
+    text, last_us, seq = row
+    removed = connection.execute(
+        """DELETE FROM event WHERE twin = ? AND seq IN
+           (SELECT seq FROM event WHERE twin = ? AND seq < ? ORDER BY seq LIMIT 500)""",
+        (twin, twin, seq - EVENTS),
+    ).rowcount
+    kept = Retention.of(text)
+    if not removed and last_us is not None:
+        removed = _old_samples(connection, twin, kept, last_us) or _old_residuals(connection, twin, kept, last_us)
+    removed = removed or _old_jobs(connection, twin, kept) or _old_models(connection, twin, kept)
+    return removed or _dear_residuals(connection, twin)
 
 
 def _old_samples(connection: Connection, twin: int, kept: Retention, last_us: int) -> int:
@@ -146,7 +159,7 @@ def _old_models(connection: Connection, twin: int, kept: Retention) -> int:
         return 0
     query = "SELECT version, summary FROM model WHERE twin = ? ORDER BY version DESC"
     rows = [(version, _parent(text)) for version, text in connection.execute(query, (twin,))]
-    active = _active(connection, twin)
+    active = models.active_version(connection, twin)
     stay = {active, *[version for version, _ in rows if version != active][: kept.models]}
     stay |= {parent for version, parent in rows if version in stay}
     gone = [version for version, _ in rows if version not in stay]
@@ -160,12 +173,6 @@ def _parent(summary: str) -> int | None:
     return found
 
 
-def _active(connection: Connection, twin: int) -> int | None:
-    query = "SELECT version FROM activation WHERE twin = ? ORDER BY id DESC LIMIT 1"
-    row = connection.execute(query, (twin,)).fetchone()
-    return None if row is None else int(row[0])
-
-
 def remove_model(connection: Connection, twin: int, version: int) -> None:
     """Remove a version with all that was derived by it; its residuals go bit by bit, since their model is no more."""
     for table in ("checkpoint", "anomaly", "floor"):
@@ -177,7 +184,7 @@ def delete_model(connection: Connection, twin: int, version: int) -> None:
     """Remove a version; Missing if there is none, Conflicting if it is active."""
     if connection.execute("SELECT 1 FROM model WHERE twin = ? AND version = ?", (twin, version)).fetchone() is None:
         raise Missing(f"version: there is no model version {version}")
-    if version == _active(connection, twin):
+    if version == models.active_version(connection, twin):
         raise Conflicting(f"version {version} is active; activate another one first")
     remove_model(connection, twin, version)
 
@@ -192,7 +199,8 @@ def _dear_residuals(connection: Connection, twin: int) -> int:
         return removed
     size = "SELECT coalesce(sum(length(value) + 8 * n), 0) FROM {} WHERE twin = ?"
     versions = connection.execute(
-        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version != ?", (twin, _active(connection, twin) or 0)
+        "SELECT DISTINCT version FROM residual WHERE twin = ? AND version != ?",
+        (twin, models.active_version(connection, twin) or 0),
     ).fetchall()
     if not versions or (
         connection.execute(size.format("residual"), (twin,)).fetchone()[0]

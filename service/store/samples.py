@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from service.store import outline
 from service.store.batch import Batch
 from service.store.blobs import instants, matrix
-from service.store.connection import Connection
+from service.store.connection import Connection, Head, Row, Stage
 from service.store.errors import TwinGone
 from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
 
@@ -25,6 +25,8 @@ MOST_SMALL_CHUNKS = 64
 MOST_SMALL_ROWS = 16_384
 MOST_CUTS = 16
 """Compaction cuts where a step exceeds this fraction of the whole span, so at most this often."""
+STAGED_BYTES = 1900
+"""What is larger does not fit a row of PostgreSQL and is written out of line, on its way through a stage twice."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +77,27 @@ def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
     if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
+        stage: Stage | None = getattr(connection, "stage", None)
+        if stage is not None and 8 * (batch.values.size + 3 * time_us.size) < STAGED_BYTES:
+            known = stage.head(twin)
+            if known is not None and (known.last_us is None or known.last_us < time_us[0]):
+                return _put(connection, stage, known, twin, batch)
         head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
         if head is not None:
             _write(connection, twin, batch, head)
             return Receipt(np.zeros(time_us.size, dtype=np.int8), head[0] - int(time_us.size) + 1, int(time_us[-1]))
     return _merge_in(connection, twin, batch)
+
+
+def _put(connection: Connection, stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
+    """Store a small batch that comes after everything that is stored, together with those of other twins."""
+    n, first_seq, last_us = int(batch.time_us.size), head.seq + 1, int(batch.time_us[-1])
+    head.seq, head.last_us = head.seq + n, last_us
+    head.small_chunks, head.small_rows = head.small_chunks + 1, head.small_rows + n
+    stage.put(_segment(twin, np.arange(first_seq, first_seq + n), batch))
+    if head.small_chunks >= MOST_SMALL_CHUNKS or head.small_rows >= MOST_SMALL_ROWS:
+        _compact(connection, twin, values_rows=batch.values.shape[0])
+    return Receipt(np.zeros(n, dtype=np.int8), first_seq, last_us)
 
 
 def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
@@ -143,20 +161,25 @@ def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Bat
     has_outline = batch.time_us.size >= outline.PIECE
     row = connection.execute(
         _INSERT + " RETURNING id" if has_outline else _INSERT,  # to return it costs a tenth of a small batch
-        (
-            twin,
-            int(batch.time_us.size),
-            int(batch.time_us.min()),
-            int(batch.time_us.max()),
-            int(seq.max()),
-            np.ascontiguousarray(seq, dtype="<i8").data,
-            np.ascontiguousarray(batch.time_us, dtype="<i8").data,
-            np.ascontiguousarray(batch.values, dtype="<f8").data,
-            None if batch.received_us is None else np.ascontiguousarray(batch.received_us, dtype="<i8").data,
-        ),
+        _segment(twin, seq, batch),
     )
     if has_outline:
         outline.put(connection, "chunk", int(row.fetchone()[0]), batch.time_us, batch.values)
+
+
+def _segment(twin: int, seq: NDArray[np.int64], batch: Batch) -> Row:
+    """Return a batch as a row of the table of chunks."""
+    return (
+        twin,
+        int(batch.time_us.size),
+        int(batch.time_us.min()),
+        int(batch.time_us.max()),
+        int(seq.max()),
+        np.ascontiguousarray(seq, dtype="<i8").data,
+        np.ascontiguousarray(batch.time_us, dtype="<i8").data,
+        np.ascontiguousarray(batch.values, dtype="<f8").data,
+        None if batch.received_us is None else np.ascontiguousarray(batch.received_us, dtype="<i8").data,
+    )
 
 
 def unpack(n_rows: int, time: bytes, value: bytes, received: bytes | None) -> Batch:

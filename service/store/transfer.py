@@ -26,7 +26,7 @@ TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("number",),
         (
             *("number", "id", "twin", "kind", "state", "progress", "message", "request", "created_us", "started_us"),
-            *("finished_us", "result", "page", "attempt", "worker", "beat_us", "cancel"),
+            *("finished_us", "result", "page", "attempt", "worker", "beat_us", "cancel", "returned"),
         ),
     ),
     "event": (("twin", "seq"), ("twin", "seq", "time_us", "type", "body")),

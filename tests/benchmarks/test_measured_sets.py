@@ -144,17 +144,20 @@ def test_only_what_the_cache_lacks_is_run(
 ) -> None:
     for name in ("daisy_heating", "chandra_psmc"):
         (tmp_path / name).mkdir()
-    ran = []
+    ran: list[str] = []
+    compiled: list[object] = []
 
     def run(name: str, work: object, code: str, deadline_s: float) -> Result:
         ran.append(name)
         return Result(name, code, deadline_s, error="ValueError: no" if "800" in name else "", verdict="unexplained")
 
     monkeypatch.setattr(measured_run, "supervised", run)
+    monkeypatch.setattr(measured_run, "alone", lambda work, limit_s: compiled.append(work))
     arguments = ["--data", str(tmp_path), "--cache", str(tmp_path / "c.jsonl"), "--deadline", "5", "--only", "lamp"]
     measured_sets.main(arguments)
     measured_sets.main(arguments)
     printed = capsys.readouterr().out
+    assert compiled == [measured_run._compile]  # once, before the runs that there were
     assert len(ran) == 2 and printed.count("2 runs: 1 crashed") == 2 and "saved" not in printed
     measured_sets.main([*arguments, "--fresh"])
     assert len(ran) == 4

@@ -22,7 +22,7 @@ def builder() -> ModuleType:
     return module
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("script", sorted(FOLDER.glob("*_*.py")), ids=lambda path: path.stem)
 def test_a_notebook_is_what_its_script_prints(script: Path) -> None:
     made = builder().notebook(script.read_text())

@@ -13,7 +13,7 @@ import psycopg
 import pytest
 
 from service.app import create_app
-from service.live import engine
+from service.live import engine, forecasts
 from service.settings import read_settings
 from tests.service.harness import AppClient
 from tests.service.postgres import NoPostgres, fresh_database, own_server
@@ -37,6 +37,8 @@ SPEC: dict[str, Any] = {
 
 STORE, NAMED = (os.environ.get(name) for name in ("TWIN_TEST_STORE", "TWIN_TEST_POSTGRES_URL"))
 """Read before tests empty the environment of what is the service's."""
+SETTLE_S = 60.0
+"""What is asked for is waited for as long: on a busy machine a worker process takes more than ten seconds to start."""
 MakeClient = Callable[..., AppClient]
 Sql = Callable[[str], list[tuple[Any, ...]]]
 
@@ -141,6 +143,7 @@ def make_client(
 ) -> Iterator[MakeClient]:
     """Return a function that starts a service on the test's database; all are stopped at the end."""
     monkeypatch.setattr(engine, "_start", lambda workers: START(1) if workers == 1 else standing_workers)
+    monkeypatch.setattr(forecasts, "SETTLE_S", SETTLE_S)
     opened: list[AppClient] = []
 
     def make(workbench: Any = None, **settings: Any) -> AppClient:

@@ -21,7 +21,7 @@ from service.live.silence import Silence
 from service.monitoring.logs import JsonLines
 from service.running import dispatch
 from service.settings import SettingsError, read_settings
-from service.store.sqlite import migrations
+from service.store import schema
 from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
@@ -285,14 +285,14 @@ def test_a_migration_is_rehearsed_and_leaves_the_file_alone(tmp_path: Path, caps
     path = tmp_path / "twin.sqlite3"
     with sqlite3.connect(path, isolation_level=None) as connection:
         connection.execute("CREATE TABLE migration (name TEXT PRIMARY KEY, at TEXT DEFAULT CURRENT_TIMESTAMP)")
-        for name, step in migrations.STEPS[:3]:
-            step(connection)
+        for name, script in schema.STEPS[:3]:
+            connection.executescript(script)
             connection.execute("INSERT INTO migration (name) VALUES (?)", (name,))
     connection.close()
     held = path.read_bytes()
     assert main(["migrate", "--rehearse", "--database", str(path), "--json"]) == 0
     tried = json.loads(capsys.readouterr().out)
-    assert tried["steps"] == [name for name, _ in migrations.STEPS[3:]] and tried["rehearsed"]
+    assert tried["steps"] == [name for name, _ in schema.STEPS[3:]] and tried["rehearsed"]
     assert path.read_bytes() == held
     assert main(["migrate", "--database", str(path)]) == 0
     capsys.readouterr()

@@ -507,3 +507,14 @@ def test_a_twin_says_while_it_catches_up(make_client, tmp_path: Path, monkeypatc
     assert client.get(TWIN).json()["catching_up"] is False
     send(client, [100], [290.0])
     assert client.get(TWIN).json()["catching_up"] is False  # one sample is nothing to catch up with
+
+
+def test_what_was_stored_counts_though_word_of_it_is_late(client: AppClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who sees a model or a sample in the database may ask what follows from it before the tracker has heard of it."""
+    for name in ("model_changed", "arrived"):
+        monkeypatch.setattr(f"service.live.live.Live.{name}", lambda live, twin: None)
+    assert len(squares(client)) == 100
+    send(client, [100], [SCALE_K * 10_000])
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()["from"] == "1970-01-01T00:01:40Z"
+    calibrate(client)
+    assert client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()["model_version"] == 2

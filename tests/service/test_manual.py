@@ -44,7 +44,7 @@ def finish(client: TwinClient) -> None:
 
 
 @pytest.mark.e2e
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_guide_runs(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
     sent = requests()
     assert len(sent) >= 9 and sent[0][1] == "/v1/twins"

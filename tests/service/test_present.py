@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.live.scout import Scout
+from service.live.tracker import Tracker
+from service.store.models import Active
 from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
@@ -78,7 +81,17 @@ def caught_up(client: AppClient) -> None:
         time.sleep(0.05)
 
 
-def test_after_an_activation_a_forecast_is_from_the_present_at_once(make_client, gate: Path) -> None:
+def test_after_an_activation_a_forecast_is_from_the_present_at_once(
+    make_client, gate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Word of the model comes a second time meanwhile, as it does where several processes share a database."""
+    send_scout = Tracker._send_scout
+
+    async def told_again(tracker: Tracker, active: Active) -> Scout:
+        tracker.model_changed()
+        return await send_scout(tracker, active)
+
+    monkeypatch.setattr(Tracker, "_send_scout", told_again)
     client = make_client(workbench=Gated)
     client.post("/v1/twins", json=SPEC)
     send(client, 0, 100)

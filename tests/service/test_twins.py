@@ -6,7 +6,7 @@ import pytest
 
 from service.store.errors import TwinGone
 from service.twins.registry import Entry
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, STORE
 from tests.service.harness import AppClient
 
 
@@ -89,6 +89,7 @@ def test_jobs_of_a_twin_that_was_deleted_meanwhile_are_refused(client: AppClient
         client.portal.call(service.jobs.start, entry, "calibration", {})
 
 
+@pytest.mark.skipif(STORE == "postgres", reason="another process may follow the samples: what it wrote down is told")
 def test_without_assimilation_there_is_an_archive_but_no_state(make_client) -> None:
     client: AppClient = make_client(assimilate=False)
     client.post("/v1/twins", json=SPEC)

@@ -72,6 +72,19 @@ def test_a_frame_becomes_a_record_and_a_frame_again(spec: tt.TwinSpec, index: An
     np.testing.assert_allclose(back["T_cup"], given["T_cup"])
 
 
+def test_rows_out_of_order_are_the_same_record(spec: tt.TwinSpec) -> None:
+    given = frame(INDICES["zone"])
+    record, shuffled = (tt.from_dataframe(f, spec) for f in (given, given.sample(frac=1.0, random_state=0)))
+    assert shuffled.epoch_ns == record.epoch_ns
+    np.testing.assert_array_equal(shuffled.time_s, record.time_s)
+    np.testing.assert_array_equal(shuffled.values["T_cup"], record.values["T_cup"])
+
+
+def test_an_index_of_words_is_refused_in_one_line(spec: tt.TwinSpec) -> None:
+    with pytest.raises(tt.TwinError, match=r"^[^\n]+neither instants nor seconds[^\n]+$"):
+        tt.from_dataframe(frame([f"sample {i}" for i in range(400)]), spec)
+
+
 def test_seconds_stay_seconds(spec: tt.TwinSpec) -> None:
     by_column = frame().rename_axis("time_s").reset_index()
     for given in (frame(), by_column, frame(pd.to_timedelta(frame().index, unit="s"))):

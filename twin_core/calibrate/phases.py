@@ -13,7 +13,15 @@ from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import Calibration, Loss, acceptance, fit_trajectories, to_model, with_met
+from twin_core.calibrate.second_order import (
+    READINGS_PER_UNKNOWN,
+    Calibration,
+    Loss,
+    acceptance,
+    fit_trajectories,
+    to_model,
+    with_met,
+)
 from twin_core.calibrate.statistics import score, spread_of
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
@@ -94,7 +102,8 @@ def at_rest(
     values
         Channel -> value in the channel's own unit; sensors that were not read are left out.
     samples
-        How many samples stand for it: its weight in the fit.
+        How many samples stand for it: its weight in the fit. They are more where a network has many nodes and few sensors: the
+        initial temperature of every node is an unknown, although it leaves no trace.
     epoch_ns
         Unix nanoseconds of the phase, where the other phases are dated.
 
@@ -116,6 +125,7 @@ def at_rest(
     read = [sensor for sensor in spec.sensors if sensor in known]
     if not read:
         raise TelemetryError(f"{name}: no sensor was read (known: {', '.join(spec.sensors)})")
+    samples = max(samples, SAMPLES_AT_REST[0] + -(-READINGS_PER_UNKNOWN * len(spec.nodes) // len(read)))
     columns = {c: to_si(np.full(samples, v), spec.channels[c].unit) for c, v in known.items()}
     typical_K = float(np.mean([columns[sensor][0] for sensor in read]))
     moment = Record(np.array([0.0, 1.0]), {c: v[:2] for c, v in columns.items()}, epoch_ns, name)

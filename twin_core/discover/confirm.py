@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.calibrate.optimise import Optimum, minimise
@@ -410,7 +410,7 @@ def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence
     """Return evidence from a gain in log-likelihood: every parameter and every candidate tried is paid for."""
     extra = max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)
     penalty = 0.5 * extra * np.log(max(rich.n_samples, 2)) + np.log(max(n_tried, 1))
-    p_value = min(1.0, max(n_tried, 1) * float(chi2.sf(2.0 * max(gain, 0.0), extra)))
+    p_value = min(1.0, max(n_tried, 1) * float(chdtrc(extra, 2.0 * max(gain, 0.0))))
     return Evidence(float(gain - penalty), p_value)
 
 

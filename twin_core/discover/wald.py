@@ -1,7 +1,7 @@
 """Wald test of effects: whether a record determines their size. Confounded ones fit well at many sizes."""
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.covariance import trajectory_covariance
@@ -84,4 +84,4 @@ def score_needed(needed: float) -> float:
 
     Its evidence has paid for the candidates that were tried; here it is asked whether it has a size.
     """
-    return float(norm.isf(0.5 * np.exp(-needed)))
+    return float(-ndtri(0.5 * np.exp(-needed)))

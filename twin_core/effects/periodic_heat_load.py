@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, Quality, Survey, Where
@@ -92,6 +91,8 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     node
         Whose sensors are looked at; all sensors where it has none.
     """
+    from scipy.signal import find_peaks  # loads scipy.stats: half a second that few need
+
     window = max(survey.segments(), key=lambda s: survey.along.time_s[s.stop - 1] - survey.along.time_s[s.start])
     spec = survey.layout.spec
     own = [i for i, sensor in enumerate(spec.sensors) if survey.layout.sensor_node(sensor) == node]

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.calibrate.result import CalibratedModel
@@ -230,7 +230,7 @@ def _differences(
         mean_cov = _mean(information[others], vector[others], apart)[1]
         own_cov = np.linalg.inv(information[i])
         std = np.sqrt(np.diag(own_cov) + apart**2 + np.diag(mean_cov))
-        p[i] = 2.0 * norm.sf(np.abs(own_cov @ vector[i] - about) / std)
+        p[i] = 2.0 * ndtr(-np.abs(own_cov @ vector[i] - about) / std)
     order = np.sort(p, axis=None)
     passing = np.flatnonzero(order <= rate * np.arange(1, order.size + 1) / order.size)  # Benjamini and Hochberg 1995
     threshold = order[passing[-1]] if passing.size else -1.0

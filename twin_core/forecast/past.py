@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import norm
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.forecast.assumed import Rule
@@ -84,7 +83,7 @@ def missed(rules: Mapping[str, Rule], now_s: float, forcing: Forcing) -> Missed 
 def widening(n_independent: float) -> float:
     """Return by what factor a 90 % interval has to be wider because mean and spread come from so few: Student's t."""
     n = max(n_independent, FEWEST_STRETCHES)
-    return float(student.ppf(0.95, n - 1.0) * np.sqrt(1.0 + 1.0 / n) / norm.ppf(0.95))
+    return float(stdtrit(n - 1.0, 0.95) * np.sqrt(1.0 + 1.0 / n) / ndtri(0.95))
 
 
 def _together(rules: Mapping[str, Rule]) -> list[dict[str, Rule]]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.stats import f as fisher
+from scipy.special import fdtr
 
 from twin_core._typing import FloatArray
 
@@ -69,7 +69,7 @@ def find_period(time_s: FloatArray, column: FloatArray, *, held: bool) -> Period
     independent = lag / (1.0 + 2.0 * (r[1 : int(0.5 * lag) + 1] ** 2).sum())
     freedom = independent * (n_cycles - 1) / 1.5, independent * n_cycles
     n_lags = max(1.0, independent * n_cycles / LEAST_CYCLES)
-    p_value = float(min(1.0, n_lags * fisher.cdf(change / within, *freedom)))
+    p_value = float(min(1.0, n_lags * fdtr(*freedom, change / within)))
     return Period(float(lag) * spacing_s, p_value) if p_value <= SIGNIFICANCE else None
 
 

@@ -76,7 +76,9 @@ class Deck:
         own[node] = own.get(node, 0.0) + value_W
 
 
-def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: str) -> Imported:
+def specified(
+    deck: Deck, channels: Mapping[str, str], *, held: bool, source: str, by_submodel: bool = False
+) -> Imported:
     """Return the specification of a deck.
 
     Parameters
@@ -89,6 +91,9 @@ def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: st
         Take couplings and capacities as known; else couplings are guesses.
     source
         The deck's file, for messages.
+    by_submodel
+        Keep the couplings as they are, but for a factor, guessed as 1, of all conductors and one of all radiation between the
+        nodes of two submodels, or within one: what stands before the dot of a node's name.
     """
     for node in channels:
         if node not in deck.capacities:
@@ -104,11 +109,19 @@ def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: st
     if dropped:
         notes.append(f"{source}: {len(dropped)} couplings are below {SMALLEST:g} and left out ({dropped[0]}, ...)")
     key = "value" if held else "guess"
+    factors: dict[str, Json] = {}
 
-    def couplings(table: Mapping[tuple[str, str], float], what: str) -> list[Json]:
+    def size(pair: tuple[str, str], kind: str, value: float) -> Json:
+        if not by_submodel:
+            return {key: number(value)}
+        factor = "_".join((kind, *sorted({node.split(".")[0] for node in pair})))
+        factors[factor] = {"guess": 1.0}
+        return {"value": number(value), "scale": factor}
+
+    def couplings(table: Mapping[tuple[str, str], float], kind: str, what: str) -> list[Json]:
         outer = set(deck.boundaries)
         return [
-            {"between": list(pair), what: {key: number(value)}}
+            {"between": list(pair), what: size(pair, kind, value)}
             for pair, value in table.items()
             if value >= SMALLEST and not set(pair) <= outer
         ]
@@ -135,12 +148,13 @@ def specified(deck: Deck, channels: Mapping[str, str], *, held: bool, source: st
         {"id": node, "capacity_J_per_K": {"value": number(capacity)}} | ({"sensor": read[node]} if node in read else {})
         for node, capacity in deck.capacities.items()
     ]
-    one_way = couplings(deck.one_way, "conductance_W_per_K")
-    document["conductors"] = couplings(deck.linear, "conductance_W_per_K") + [
+    one_way = couplings(deck.one_way, "GL", "conductance_W_per_K")
+    document["conductors"] = couplings(deck.linear, "GL", "conductance_W_per_K") + [
         {**entry, "into": entry["between"][1]} for entry in one_way
     ]
-    document["radiation"] = couplings(deck.radiative, "area_m2")
+    document["radiation"] = couplings(deck.radiative, "GR", "area_m2")
     document["loads"] = loads
+    document["parameters"] = factors
     whole = {k: v for k, v in document.items() if v}
     courses = {name: deck.courses[name] for name in driven}
     return Imported(whole, tuple(notes), tuple(deck.refused), dict(deck.start_K), courses)

@@ -17,14 +17,25 @@ _HEADER = re.compile(r"^\s*HEADER\s+([A-Z0-9 ]+?)\s*(?:,\s*(\w+))?\s*$", re.IGNO
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[EeDd][-+]?\d+)?"
 _HEAT = re.compile(rf"^\s*(?:(\w+)\.)?Q(\d+)\s*=\s*(?:(?:\1\.)?Q\2\s*\+\s*)?({_NUMBER})\s*$", re.IGNORECASE)
 
+_SETTING = re.compile(rf"^(?!SIGMA|ABSZRO|[TCQGX]\d)[A-Z]\w*\s*=\s*{_NUMBER}$")
+"""A constant of the solution, such as TIMEND, is set: no temperature, heat, conductor or unit."""
+
 _RATED = re.compile(r"^C\s+solar albedo planetshine - (\S+)\s")
 
-_SILENT = ("OPTIONS", "OPERATION DATA", "OUTPUT CALLS", "SOLVER")
+_TOLD = ("OPTIONS", "OUTPUT CALLS", "SOLVER")
 """Blocks that say how to solve and print, not what the model is."""
+
+_SOLUTIONS = ("STEADY", "FASTIC", "STDSTL", "TRANSIENT", "FWDBCK", "FORWRD")
+"""Routines of SINDA that solve the model as it is."""
 
 
 def read_sinda(
-    texts: Mapping[str, str], *, channels: Mapping[str, str] | None = None, held: bool = False, over_time: bool = False
+    texts: Mapping[str, str],
+    *,
+    channels: Mapping[str, str] | None = None,
+    held: bool = False,
+    over_time: bool = False,
+    by_submodel: bool = False,
 ) -> Imported:
     """Return a deck as a specification.
 
@@ -39,14 +50,17 @@ def read_sinda(
         Take couplings as known; by default they are guesses.
     over_time
         Read the course of the heat rates over the orbit, a channel per node, instead of their averages.
+    by_submodel
+        Calibrate a factor for the couplings of each pair of submodels instead of every coupling.
     """
     reader = _Reader(over_time, Deck(twin_id(next(iter(texts)).rsplit("/", 1)[-1].split(".")[0])))
     for source in sorted(texts, key=lambda name: not name.endswith(".inp")):  # its constants come first
         reader.read(source, texts[source])
     deck = reader.deck
+    reader.operate()
     for pair, line in reader.unseen.items():
         deck.refused.append(f"{line}: node '{pair}' is declared nowhere")
-    return specified(deck, channels or {}, held=held, source=next(iter(texts)))
+    return specified(deck, channels or {}, held=held, source=next(iter(texts)), by_submodel=by_submodel)
 
 
 class _Reader:
@@ -57,6 +71,8 @@ class _Reader:
         self.sigma = STEFAN_BOLTZMANN_W_PER_M2_K4
         self.zero = 0.0
         self.unseen: dict[str, str] = {}
+        self.routines: set[str] = set(_SOLUTIONS)
+        self.operations: dict[str, list[tuple[str, str]]] = {}
         self.waiting: list[tuple[str, str, str, bool, float]] = []
         self.rates: list[float] = []
         self.rated: list[str] = []
@@ -67,7 +83,7 @@ class _Reader:
 
     def read(self, source: str, text: str) -> None:
         """Read one file."""
-        block, submodel = "", "MAIN"
+        block, submodel, opened = "", "MAIN", source
         self.rates, self.rated, self.times, self.courses = [], [], [], {}
         self.announced = self.filling = None
         self.waiting = []
@@ -81,19 +97,46 @@ class _Reader:
                 continue
             if header := _HEADER.match(line):
                 block, submodel = " ".join(header[1].upper().split()), (header[2] or submodel).upper()
+                if block in _TOLD:
+                    self.deck.notes.append(f"{where}: HEADER {block} says how to solve and print; it is passed over")
+                opened = where
                 continue
             handle = self._handlers().get(block)
             if handle is not None:
                 if not handle(where, submodel, line):
                     self.deck.refused.append(f"{where}: '{line.strip()[:60]}' in HEADER {block} is not understood")
+            elif block == "OPERATION DATA":
+                self.operations.setdefault(opened, []).append((where, line.strip().upper()))
             elif block == "SUBROUTINE":
+                if named := re.match(r"^[FM ]?\s*SUBROUTINE (\w+)", line):
+                    self.routines.add(named[1].upper())
                 if not re.match(r"^[FM ]?\s*(SUBROUTINE \w+|RETURN|END|CALL COMMON)\s*$", line):
                     self.deck.refused.append(f"{where}: '{line.strip()[:60]}' is code, which is not read")
-            elif block not in _SILENT and not self._neutral(where, line):
+            elif block not in _TOLD and not self._neutral(where, line):
                 self.deck.refused.append(f"{where}: '{line.strip()[:60]}' in HEADER {block or '?'} is not read")
         for where, first, second, radiates, value in self.waiting:
             self._join(where, first, second, radiates, value)
         self._apply_rates(source)
+
+    def operate(self) -> None:
+        """Tell what the deck runs, once all of it is read: submodels that are built, solutions, routines of its own.
+
+        The code of these routines is refused line by line where it stands.
+        """
+        submodels = {node.split(".")[0] for node in (*self.deck.capacities, *self.deck.boundaries)}
+        for opened, lines in self.operations.items():
+            for where, line in lines:
+                if built := re.match(r"BUILDF?\s+(.+)$", line):
+                    names = set(re.split(r"[\s,]+", built[1]))
+                    if lacking := sorted(submodels - names) if "ALL" not in names else []:
+                        self.deck.refused.append(f"{where}: '{line[:60]}' leaves out {', '.join(lacking)}; all is read")
+                elif called := re.match(r"(?:[FM]\s+)?CALL\s+(\w+)", line):
+                    if called[1] not in self.routines:
+                        self.deck.refused.append(f"{where}: the routine '{called[1]}' stands nowhere in the deck")
+                elif not _SETTING.match(line):
+                    self.deck.refused.append(f"{where}: '{line[:60]}' is code, which is not read")
+            said = "; ".join(line for _, line in lines)
+            self.deck.notes.append(f"{opened}: HEADER OPERATION DATA says what to run and is passed over ({said})")
 
     def _handlers(self) -> dict[str, Callable[[str, str, str], bool]]:
         return {

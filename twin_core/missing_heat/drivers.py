@@ -7,7 +7,6 @@ repeats with the driver is predicted; heat that merely happened to go along with
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.signal import find_peaks
 
 from twin_core._typing import FloatArray
 
@@ -68,6 +67,8 @@ def _broken_line(driver: FloatArray, heat_W: FloatArray, wanted: FloatArray) -> 
 
 def phases(time_s: FloatArray, heat_W: FloatArray) -> dict[float, FloatArray]:
     """Return period in s -> phase between 0 and 1 along the record, for periods about those that stand out in a heat."""
+    from scipy.signal import find_peaks  # loads scipy.stats: half a second that few need
+
     grid = np.linspace(time_s[0], time_s[-1], time_s.size)
     even = np.interp(grid, time_s, heat_W - heat_W.mean())
     power = np.abs(np.fft.rfft(even * np.hanning(grid.size), 4 * grid.size)) ** 2

@@ -233,4 +233,4 @@ def _channel(spec: "TwinSpec", field: str, name: str, kinds: tuple[str, ...]) ->
 
 def _end(field: str, name: str, known: list[str], what: str = "node") -> Iterable[str]:
     if name not in known:
-        yield f"{field}: unknown {what} '{name}' (known: {', '.join(known) or 'none'})"
+        yield f"{field}: unknown {what} '{name}' (known: {', '.join(dict.fromkeys(known)) or 'none'})"

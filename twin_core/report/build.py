@@ -69,6 +69,7 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
     rows = []
     for finding in sorted(findings, key=lambda f: -f.judged.evidence.log_bayes_factor):
         experiments = [experiment.row() for experiment in separating(finding)]
+        together = {effect.place for effect in finding.effects}
         for effect in finding.effects:
             own = fitted[effect.place]
             rows.append(
@@ -87,7 +88,10 @@ def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[J
                             "log_bayes_factor": option.evidence.log_bayes_factor,
                         }
                         for option in finding.alternatives
+                        # What an alternative has as well is not in doubt, and no alternative to anything.
+                        if effect.place not in {other.place for other in option.effects}
                         for other in option.effects
+                        if other.place not in together
                     ],
                     "experiments": experiments,
                 }

@@ -143,8 +143,8 @@ def _spans_of(calibration: Calibration, moment: Moment) -> Iterator[tuple[str, i
         if not segment.record.time_s[0] <= begin_s <= end_s <= segment.record.time_s[-1]:
             continue
         ends_s = segment.forcing.stage_time_s[:, 1]
-        first = min(int(np.searchsorted(ends_s, begin_s)), ends_s.size - 1)
-        last = min(int(np.searchsorted(ends_s, end_s)), ends_s.size - 1)
+        first = min(int(np.searchsorted(ends_s, begin_s, side="right")), ends_s.size - 1)
+        last = max(first, min(int(np.searchsorted(ends_s, end_s)), ends_s.size - 1))
         yield ("chosen moment" if start == stop else "on average over the chosen phase"), number, first, last + 1
         return
 

@@ -20,12 +20,25 @@ SPARSE = 1.0
 quicker."""
 
 
+FILLED = 0.05
+"""Beyond this share of entries a change of A is quicker as a full matrix than entry by entry."""
+
+
 @njit(cache=True, nogil=True)
 def _add_entries(row: IntArray, column: IntArray, entry: FloatArray, weight: FloatArray, out: FloatArray) -> None:
     """Add weight @ (the matrix with these entries) to ``out``, both transposed."""
     for e in range(row.size):
         for i in range(out.shape[1]):
             out[column[e], i] += weight[row[e], i] * entry[e]
+
+
+def _add_changed(row: IntArray, column: IntArray, entry: FloatArray, weight: FloatArray, out: FloatArray) -> None:
+    """Add weight @ (the matrix with these entries) to ``out``, both transposed, the quicker way."""
+    n = out.shape[0]
+    if row.size > FILLED * n * n:
+        out += np.bincount(column * n + row, weights=entry, minlength=n * n).reshape(n, n) @ weight
+    else:
+        _add_entries(row, column, entry, weight, out)
 
 
 @njit(cache=True, nogil=True)
@@ -129,8 +142,8 @@ def march_sensitivities_of_many(
             if turns.columns.size > 0:
                 divided_differences(at_s, modes.rate_per_s, keep, early, late, divided)
         forward, backward = turned_keep.copy(), identity.copy()
-        _add_entries(row, column, entry[k, 0], turned_early, forward)
-        _add_entries(row, column, -entry[k, 1], turned_late, backward)
+        _add_changed(row, column, entry[k, 0], turned_early, forward)
+        _add_changed(row, column, -entry[k, 1], turned_late, backward)
         # Close to the identity, so that its inverse is as good as its factors, and the quicker way to products.
         solved = np.concatenate([forward, outward]) @ np.linalg.inv(backward)
         given[:] = 0.0

@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from twin_core._typing import FloatArray, IntArray
+from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4, ZERO_CELSIUS_K
 from twin_core.network.dynamics import Balance, evaluate_balance, fill_boundaries
 from twin_core.network.jacobian import Jacobian
@@ -287,8 +287,8 @@ class Split:
             given, linear = given + rate.reshape(given.shape), linear + jacobian.constant
             moving, at = jacobian.moving.reshape(last - first, 2, -1), (jacobian.row, jacobian.column)
         size = np.abs(self.slope_W_per_K / self.own_J_per_K[:, None])
-        row, column = np.nonzero(np.abs(linear) > 1e-14 * size)
-        q_row, q_column = np.nonzero(fourth)
+        row, column = entries(np.abs(linear) > 1e-14 * size)
+        q_row, q_column = entries(fourth != 0.0)
         left = Remainder(
             row,
             column,
@@ -300,6 +300,15 @@ class Split:
             np.ascontiguousarray(moving),
         )
         return left, np.ascontiguousarray(given)
+
+
+def entries(present: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return rows and columns of the entries of a matrix that are present, each (n_entries,) and contiguous.
+
+    What NumPy's ``nonzero`` returns is contiguous for one entry alone, and every layout costs a compilation of its own.
+    """
+    row, column = np.nonzero(present)
+    return np.ascontiguousarray(row), np.ascontiguousarray(column)
 
 
 def less_modes(jacobian: Jacobian, slope_W_per_K: FloatArray, own: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:

@@ -13,6 +13,7 @@ from psycopg import errors
 from service.store.connection import Connection, Cursor
 from service.store.errors import DiskFull, StoreError, Unavailable
 from service.store.postgres.migrations import migrate
+from service.store.postgres.stage import Stage
 
 log = logging.getLogger("service.store")
 T = TypeVar("T")
@@ -38,13 +39,18 @@ class Speaking:
     def __init__(self, driver: "psycopg.Connection[Any]") -> None:
         """Take over an open connection."""
         self.driver = driver
+        self.stage: Stage | None = None
 
     def execute(self, query: str, parameters: Sequence[Any] = (), /) -> Cursor:
         """Run one statement."""
+        if self.stage is not None:
+            self.stage.make_way()
         return self.driver.execute(_translated(query), parameters, binary=True)  # type: ignore[arg-type]
 
     def executemany(self, query: str, parameters: Iterable[Sequence[Any]], /) -> Cursor:
         """Run one statement once for each row of parameters."""
+        if self.stage is not None:
+            self.stage.make_way()
         cursor = self.driver.cursor(binary=True)
         cursor.executemany(_translated(query), parameters)  # type: ignore[arg-type]
         return cursor
@@ -81,7 +87,7 @@ class PostgresSession:
     def __init__(self, url: str) -> None:
         """Connect; Unavailable if the server cannot be reached."""
         self._url = url
-        self._speaking = Speaking(connect(url))
+        self._speak()
         self._not_before_s = 0.0
 
     @property
@@ -95,22 +101,28 @@ class PostgresSession:
         return not self._speaking.driver.broken and not self._speaking.driver.closed
 
     def begin(self, twins: Collection[int]) -> None:
-        """Begin a transaction and lock the heads of these twins, in one order everywhere so that nobody waits in a circle."""
+        """Begin a transaction and lock the heads of these twins."""
         if not self.in_transaction:
             self._connect()
         self._speaking.execute("BEGIN")
         if twins:
-            query = "SELECT 1 FROM head WHERE twin = ANY(?) ORDER BY twin FOR UPDATE"
-            self._speaking.execute(query, (sorted(twins),))
+            self._stage.begin(twins)
+
+    def turn(self, twin: int | None) -> None:
+        """Hear whose twin's the next statements are; None: they may concern any."""
+        self._stage.turn(twin)
 
     def commit(self) -> None:
         """Make it durable."""
-        self._speaking.execute("COMMIT")
+        self._stage.flush()
+        self._speaking.driver.execute("COMMIT")
+        self._stage.end()
 
     def roll_back(self) -> None:
         """Undo it; a connection that cannot even do that is given up."""
+        self._stage.end()
         try:
-            self._speaking.execute("ROLLBACK")
+            self._speaking.driver.execute("ROLLBACK")
         except psycopg.Error:
             self._speaking.driver.close()
 
@@ -122,8 +134,12 @@ class PostgresSession:
         if time.monotonic() < self._not_before_s:
             raise Unavailable("the database cannot be reached; send it again")
         self._not_before_s = time.monotonic() + RETRY_S
-        self._speaking = Speaking(connect(self._url))
+        self._speak()
         log.warning("the database is there again")
+
+    def _speak(self) -> None:
+        self._speaking = Speaking(connect(self._url))
+        self._stage = self._speaking.stage = Stage(self._speaking.driver)
 
 
 class PostgresEngine:

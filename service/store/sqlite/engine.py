@@ -45,6 +45,9 @@ class SqliteSession:
         """Begin a transaction; nobody else writes at all."""
         self.connection.execute("BEGIN IMMEDIATE")
 
+    def turn(self, twin: int | None) -> None:
+        """Write each statement as it comes."""
+
     def commit(self) -> None:
         """Make it durable."""
         self.connection.execute("COMMIT")

@@ -32,7 +32,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.e2e
-@pytest.mark.slow
+@pytest.mark.long
 def test_from_orbit_to_verdict(tmp_path: Path) -> None:
     scratch = tmp_path / "scratch"
     scratch.mkdir()

@@ -31,3 +31,14 @@ def test_what_is_no_model_is_told_what_one_is(tmp_path: Path, capsys: pytest.Cap
     assert main(["import", str(tmp_path / "notes.txt"), "--out", str(tmp_path / "sat.yaml")]) == 2
     told = capsys.readouterr().err
     assert "is no model that can be read" in told and told.count("\n") == 1
+
+
+def test_a_model_of_which_nothing_is_left_says_what_was_not_understood(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.json").write_text('{"comps": [{"class_name": "Radiometer", "name": "r"}], "pars": []}')
+    arguments = ["import", str(tmp_path / "own.json"), "--out", str(tmp_path / "sat.yaml")]
+    assert main(arguments) == 2
+    assert "line 1: Radiometer 'r' is not a component that can be translated" in capsys.readouterr().err
+    assert main([*arguments, "--skip-unknown"]) == 2
+    assert "declares no node" in capsys.readouterr().err

@@ -1,12 +1,8 @@
 """Tasks on a Dask cluster whose worker, and then whose scheduler, is killed."""
 
 import os
-import signal
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import psycopg
@@ -15,6 +11,7 @@ import pytest
 from service.jobs.dask import DaskTasks
 from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Task
 from tests.service.fakes import GATE
+from tests.service.fleet.cluster import Cluster
 from tests.service.fleet.load import assert_jobs_done_once, calibrations, fleet, prepare
 from twin_core.errors import ModelError
 
@@ -35,49 +32,6 @@ def refuse(progress: Progress) -> None:
 def dawdle(progress: Progress) -> int:
     time.sleep(8)
     return os.getpid()
-
-
-class Cluster:
-    """A scheduler and a worker, each a process that a test may kill."""
-
-    def __init__(self) -> None:
-        """Start both."""
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
-        self.address = f"tcp://127.0.0.1:{self._port}"
-        self.scheduler = self.add_scheduler()
-        self.worker = self.add_worker()
-
-    def add_scheduler(self) -> "subprocess.Popen[bytes]":
-        """Start a scheduler at the address of the cluster."""
-        options = ("--host", "127.0.0.1", "--port", str(self._port), "--no-dashboard")
-        return self._start("dask_scheduler", *options)
-
-    def add_worker(self) -> "subprocess.Popen[bytes]":
-        """Start another worker."""
-        options = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1")
-        return self._start("dask_worker", self.address, *options)
-
-    @staticmethod
-    def _start(name: str, *arguments: str) -> "subprocess.Popen[bytes]":
-        command = [sys.executable, "-m", f"distributed.cli.{name}", *arguments]
-        return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
-
-    @staticmethod
-    def kill(process: "subprocess.Popen[bytes]") -> None:
-        """End a process as a crash would."""
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-@pytest.fixture
-def cluster() -> Iterator[Cluster]:
-    made = Cluster()
-    yield made
-    made.kill(made.worker)
-    made.kill(made.scheduler)
 
 
 def test_results_refusals_and_progress_come_back(cluster: Cluster) -> None:

@@ -83,14 +83,28 @@ def test_a_silent_worker_is_replaced_and_can_write_nothing_more(queue: Queue) ->
         queue.do(jobs.report, new, 0.9, "after the end")
 
 
-def test_putting_back_and_cancelling(queue: Queue) -> None:
+def test_who_gave_a_job_back_writes_nothing_of_it_any_more(queue: Queue) -> None:
+    """A progress message may still be under way when a job is given back: its token fits no later worker."""
     queue.add("first")
-    held = queue.claim("a")
+    for gives_back in (
+        lambda held: queue.do(jobs.put_back, held),
+        lambda held: queue.do(jobs.leave, "a", is_shared=True),
+    ):
+        held = queue.claim("a")
+        assert held is not None
+        gives_back(held)
+        assert queue.state("first") == "queued"
+        again = queue.claim("b")
+        assert again is not None and again.attempt > held.attempt and again.tries == 1  # to give back is no attempt
+        with pytest.raises(LeaseLost):
+            queue.do(jobs.report, held, 0.5, "too late")
+        queue.do(jobs.put_back, again)
+
+
+def test_cancelling(queue: Queue) -> None:
+    queue.add("first")
+    held = queue.claim("b")
     assert held is not None
-    queue.do(jobs.put_back, held)
-    assert queue.state("first") == "queued"
-    again = queue.claim("b")
-    assert again is not None and again.attempt == 1  # it was no attempt
     queue.do(jobs.ask_to_cancel, "first")
     assert queue.do(jobs.beat, "b") == {"first": (1, True)}
     queue.add("second")

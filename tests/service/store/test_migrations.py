@@ -10,8 +10,9 @@ import orjson
 import psycopg
 import pytest
 
+from service.store import jobs, schema
 from service.store.database import Database
-from service.store.sqlite import migrations
+from service.store.postgres import migrations
 from tests.service.conftest import SPEC
 
 TWIN = "/v1/twins/benchsat"
@@ -23,8 +24,8 @@ def old_file(tmp_path: Path) -> Path:
     path = tmp_path / "twin.sqlite3"
     connection = sqlite3.connect(path, isolation_level=None)
     connection.execute("CREATE TABLE migration (name TEXT PRIMARY KEY, at TEXT DEFAULT CURRENT_TIMESTAMP)")
-    for name, step in migrations.STEPS[: [name for name, _ in migrations.STEPS].index("clocks")]:
-        step(connection)
+    for name, script in schema.STEPS[: [name for name, _ in schema.STEPS].index("clocks")]:
+        connection.executescript(script)
         connection.execute("INSERT INTO migration (name) VALUES (?)", (name,))
     text = orjson.dumps(SPEC).decode()
     connection.execute("INSERT INTO twin (name, specification, created_us) VALUES ('benchsat', ?, 0)", (text,))
@@ -58,7 +59,7 @@ def test_an_old_archive_is_read_written_deleted_and_compacted(old_file: Path, ma
 
 
 def test_both_databases_have_the_same_columns(tmp_path: Path, postgres: str) -> None:
-    """Each has steps of its own: SQLite files lived through all of them, PostgreSQL began with the fleet."""
+    """SQLite files lived through all steps, PostgreSQL began with the fleet and has tables of its own for it."""
     kinds = {"INTEGER": "whole", "bigint": "whole", "integer": "whole", "REAL": "real", "double precision": "real"}
     kinds |= {"TEXT": "text", "text": "text", "BLOB": "bytes", "bytea": "bytes"}
     path = tmp_path / "new.sqlite3"
@@ -79,3 +80,23 @@ def test_both_databases_have_the_same_columns(tmp_path: Path, postgres: str) -> 
         theirs = {(table, name, kinds[kind], required) for table, name, kind, required in server.execute(query)}
     of_fleet = {row for row in theirs if row[0] in ("member", "slot", "tenure") or row[:2] == ("head", "epoch")}
     assert of_fleet and ours == theirs - of_fleet
+
+
+def test_an_old_server_goes_on_where_it_stood(postgres: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A job that an earlier release began is gone on with, under a number of its own."""
+    with monkeypatch.context() as earlier:
+        earlier.setattr(migrations, "STEPS", migrations.STEPS[:3])
+        Database(postgres).close()
+    with psycopg.connect(postgres, autocommit=True) as server:
+        assert server.execute("SELECT name FROM migration ORDER BY 1").fetchall() == [
+            ("base",),
+            ("fleet",),
+            ("vitals",),
+        ]
+        server.execute("INSERT INTO twin (name, specification, created_us) VALUES ('t', '{}', 0)")
+        columns = "id, twin, kind, state, request, created_us, attempt"
+        server.execute(f"INSERT INTO job ({columns}) VALUES ('j', 1, 'calibration', 'queued', '{{}}', 0, 2)")
+    database = Database(postgres)
+    held = database.submit(jobs.claim, "w", 1, is_shared=True).result(30)
+    database.close()
+    assert held is not None and (held.attempt, held.tries) == (3, 3)

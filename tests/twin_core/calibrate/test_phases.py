@@ -94,6 +94,28 @@ def test_one_conductance_from_two_phases_at_rest_is_ohms_law() -> None:
     assert found.report["after"]["rmse_K"] < 0.02 < 1.0 < found.report["before"]["rmse_K"]
 
 
+def test_one_sensor_on_many_nodes_at_rest_tells_a_conductance() -> None:
+    """All nodes hang on the one that has the sensor, so that each is as warm as it: G = Q / (T - T_wall)."""
+    hidden = [f"n{i}" for i in range(60)]
+    data = {
+        "twin": "many",
+        "boundaries": {"wall": {"value_K": 290.0}},
+        "channels": {"T": {"kind": "temperature", "unit": "K"}, "Q": {"kind": "power", "unit": "W"}},
+        "nodes": [
+            {"id": "a", "sensor": "T", "capacity_J_per_K": {"value": 900.0}},
+            *({"id": name, "capacity_J_per_K": {"value": 50.0}} for name in hidden),
+        ],
+        "conductors": [
+            {"between": ["a", "wall"], "conductance_W_per_K": {"guess": 1.0}},
+            *({"between": ["a", name], "conductance_W_per_K": {"value": 0.5}} for name in hidden),
+        ],
+        "loads": [{"channel": "Q", "node": "a"}],
+    }
+    declared = load_spec(data)
+    found = correlate(declared, [at_rest(declared, "hot", {"T": 310.0, "Q": 12.0})])
+    assert found.model.values["G:a|wall"] == pytest.approx(0.6, rel=0.01)
+
+
 def test_hot_cold_and_transient_together() -> None:
     declared, flown = spec(), transient()
     n = weight_of([flown])

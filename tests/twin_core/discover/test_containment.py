@@ -17,6 +17,7 @@ from twin_core.calibrate.second_order import fit_network, from_heat_fit
 from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.search import search
+from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
 from twin_core.report.phrasing import headline
 
@@ -41,6 +42,13 @@ def base() -> Trial:
     return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
 
 
+@pytest.fixture
+def few_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the search one effect for each way it takes: by heat, by a state of its own, by an input, and without a name."""
+    kinds = ("leak_to_boundary", "hidden_mass", "input_gain", "learned_heat_flow")
+    monkeypatch.setattr(REGISTRY, "_kinds", {name: REGISTRY[name] for name in kinds})
+
+
 def failing(solver: Callable[..., Any], after: int, every: int) -> Callable[..., Any]:
     """Return a solver that fails at a call, and from then on at every so many."""
     calls = 0
@@ -62,6 +70,7 @@ def test_a_candidate_without_a_trajectory_ends_as_a_numerical_failure(base: Tria
         from_heat_fit(base.fit, base.max_step_s, near=[nothing], afresh=False)
 
 
+@pytest.mark.usefixtures("few_kinds")
 @pytest.mark.parametrize("path", SOLVERS)
 def test_a_solver_that_fails_ends_one_candidate(base: Trial, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
     module, name = path.rsplit(".", 1)

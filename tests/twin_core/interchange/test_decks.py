@@ -222,6 +222,56 @@ def test_every_setting_of_a_line_counts(line: str, said: str) -> None:
     assert any(r.startswith("case.inp: line 4: ") and said in r for r in refused), refused
 
 
+def test_couplings_by_submodel_share_a_factor() -> None:
+    """The same steady state as with every number known, and the factors are all that is free."""
+    deck = {name: text.replace("-BOX.3", "BOX.-3") for name, text in SINDA.items()}
+    grouped = read_sinda(deck, channels={"BOX.1": "T"}, by_submodel=True)
+    assert grouped.data["parameters"] == {name: {"guess": 1.0} for name in ("GL_BOX", "GR_BOX_SPACE", "GR_BOX")}
+    network = build_network(load_spec(grouped.data))
+    assert set(network.parameters.free_names) == {"GL_BOX", "GR_BOX_SPACE", "GR_BOX"}
+    known = solved(read_sinda(deck, channels={"BOX.1": "T"}, held=True))
+    assert solved(grouped) == pytest.approx(known, abs=1e-6)
+
+
+OPERATION = "HEADER OPERATION DATA\n{}\nHEADER OUTPUT CALLS, BOX\n      CALL TPRINT('ALL')\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("BUILD ALL", "BUILD ALL"),
+        ("BUILD CASE, SPACE, BOX", "BUILD CASE, SPACE, BOX"),
+        (
+            "BUILD ALL\n      CALL TDHTR\n      CALL STEADY\n      TIMEND = 5700.",
+            "BUILD ALL; CALL TDHTR; CALL STEADY; TIMEND",
+        ),
+    ],
+)
+def test_what_a_sinda_deck_runs_is_told(lines: str, said: str) -> None:
+    routine = "HEADER SUBROUTINE\n      SUBROUTINE TDHTR\nC     nothing\n      RETURN\n      END\n"
+    deck = {"case.inp": OPERATION.format(lines), "case.cc": SINDA["case.cc"] + routine}
+    imported = read_sinda(deck, channels={"BOX.1": "T"}, held=True)
+    assert not imported.refused, imported.refused
+    assert any(n.startswith("case.inp: line 1: ") and said in n for n in imported.notes), imported.notes
+    assert any(": HEADER OUTPUT CALLS" in n and "passed over" in n for n in imported.notes), imported.notes
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("BUILD CASE, BOX", "leaves out SPACE"),
+        ("      BOX.T1 = 300.", "is code, which is not read"),
+        ("      Q1 = 3.0", "is code, which is not read"),
+        ("      CALL HTRMOD('BOX')", "'HTRMOD' stands nowhere in the deck"),
+        ("      IF (BOX.T1 .GT. 300.) CALL STEADY", "is code, which is not read"),
+    ],
+)
+def test_what_a_sinda_deck_changes_as_it_runs_is_refused(line: str, said: str) -> None:
+    deck = {"case.inp": OPERATION.format(line), "case.cc": SINDA["case.cc"]}
+    refused = read_sinda(deck, held=True).refused
+    assert any(r.startswith("case.inp: line 2: ") and said in r for r in refused), refused
+
+
 def test_a_node_that_cannot_lose_heat_has_no_steady_state() -> None:
     data = {
         "twin": "t",

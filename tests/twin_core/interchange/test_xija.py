@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.errors import SpecError
-from twin_core.interchange.xija import read_xija
+from twin_core.interchange.xija.specification import read_xija
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
@@ -233,3 +233,27 @@ def test_what_is_no_model_is_refused(text: str) -> None:
 def test_a_name_that_is_no_component_is_refused() -> None:
     with pytest.raises(SpecError, match="no component 'pich'"):
         read_xija(json.dumps(model()), "m.json", channels={"pich": "pitch_deg"})
+
+
+@pytest.mark.parametrize("power", [0.5, 2.0])
+def test_a_thermostat_without_a_deadband_holds_its_node_where_it_can(power: float) -> None:
+    """The node rises to where losses and power balance, T_sink + P tau, and stays at T_set if that is on the way."""
+    tau_ks, sink_C, set_C = 20.0, -10.0, 15.0
+
+    def component(kind: str, name: str, **kwargs: Any) -> dict[str, Any]:
+        return {"class_name": kind, "name": name, "init_args": ["box"], "init_kwargs": kwargs}
+
+    comps = [
+        component("Node", "box"),
+        component("HeatSink", "heatsink__box", T=sink_C, tau=tau_ks),
+        component("ThermostatHeater", "thermostat_heat__box", P=power, T_set=set_C),
+    ]
+    imported = read_xija(json.dumps({"name": "t", "comps": comps, "pars": [], "evolve_method": 2}), "t.json", held=True)
+    assert not imported.refused and any("no deadband" in note for note in imported.notes)
+    network = build_network(load_spec(imported.data))
+    time_s = np.arange(0.0, 120_000.0, 300.0)
+    forcing = build_forcing(network, Record(time_s, {"T_box": np.full(time_s.size, 273.15)}), 300.0)
+    path = rollout(network, network.parameters.values, np.array([sink_C + ZERO_CELSIUS_K]), forcing)
+    found_C = path.at_samples(forcing.sample_step)[:, 0] - ZERO_CELSIUS_K
+    expected = np.minimum(sink_C + power * tau_ks * -np.expm1(-time_s / (1000.0 * tau_ks)), set_C)
+    np.testing.assert_allclose(found_C, expected, atol=0.06)

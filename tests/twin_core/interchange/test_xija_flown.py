@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.flown_model import MODELS, repeated_rms_K
-from twin_core.interchange.xija import read_xija
+from twin_core.interchange.xija.specification import read_xija
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 

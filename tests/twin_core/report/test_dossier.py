@@ -70,7 +70,9 @@ def test_heat_flows_at_chosen_moments_are_those_of_the_load() -> None:
         assert load["heat_W"] == pytest.approx(watt) and abs(link["heat_W"]) == pytest.approx(watt, abs=0.05)
         assert found["phase"] == "chosen moment" and found["start"] == found["stop"]
     assert mean["loads"][0]["heat_W"] == pytest.approx(40.0, abs=0.2) and mean["phase"].endswith("chosen phase")
-    assert [found["start"] for found in (early, late)] == pytest.approx([8.0 * slow_s, 18.0 * slow_s], abs=100.0)
+    assert [found["start"] for found in (early, late)] == [8.0 * slow_s, 18.0 * slow_s]
+    (switched,) = heat_flow_maps(search, to_model(fit, ()), [(10.0 * slow_s, 10.0 * slow_s)])
+    assert switched["start"] == 10.0 * slow_s and switched["loads"][0]["heat_W"] == pytest.approx(60.0)
     with pytest.raises(TelemetryError, match=r"heat flows at 90000.0: no segment .* \(0.0 to 79900.0\)"):
         check_moments([record], [(9e4, 9e4)])
     with pytest.raises(TelemetryError, match="counts seconds"):

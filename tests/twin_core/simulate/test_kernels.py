@@ -8,7 +8,7 @@ from twin_core.simulate.derivatives import march_sensitivities, transitions
 from twin_core.simulate.kernels import Remainder, march
 from twin_core.simulate.modes import Modes, phi
 from twin_core.simulate.relays import N_KICK, NO_RELAYS
-from twin_core.simulate.splitting import modes_of
+from twin_core.simulate.splitting import entries, modes_of
 
 N, N_STEPS = 4, 12
 LOW, HIGH = np.full(N, -1e9), np.full(N, 1e9)
@@ -49,6 +49,17 @@ def problem(seed: int, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray,
         size * rng.normal(0.0, 1e-3, (N_STEPS, 2, N, N)),
         rng.normal(300.0, 20.0, N),
     )
+
+
+@pytest.mark.parametrize("cells", [[], [(1, 2)], [(0, 1), (2, 0), (3, 3)]])
+def test_entries_have_one_layout_however_many_they_are(cells: list[tuple[int, int]]) -> None:
+    """The compiled loops are compiled once for each layout."""
+    present = np.zeros((N, N), dtype=bool)
+    for cell in cells:
+        present[cell] = True
+    row, column = entries(present)
+    assert list(zip(row.tolist(), column.tolist(), strict=True)) == cells
+    assert row.flags.c_contiguous and column.flags.c_contiguous
 
 
 @pytest.mark.parametrize("z", [-1e4, -30.0, -1.0001, -0.9999, -1e-3, 0.0, 1e-9, 0.5, 3.0])

@@ -1,0 +1,90 @@
+"""Segments of many twins on their way into one table: COPY into a stage, then one INSERT … SELECT that moves the heads, too."""
+
+from collections.abc import Iterable
+from itertools import chain
+from typing import Any
+
+import psycopg
+
+from service.store.connection import Head, Row
+
+LOCK = """SELECT twin, seq, last_us, small_chunks, small_rows FROM head WHERE twin = ANY(%s) ORDER BY twin FOR UPDATE"""
+COLUMNS = {
+    **dict.fromkeys(("twin", "n", "first_us", "last_us", "last_seq"), "int8"),
+    **dict.fromkeys(("seq", "time", "value", "received"), "bytea"),
+}
+MAKE = f"""CREATE TEMPORARY TABLE IF NOT EXISTS stage ({", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())})
+           ON COMMIT DELETE ROWS"""
+STORE = """WITH staged ({names}) AS ({source}),
+           taken AS (SELECT twin, sum(n) AS n, count(*) AS chunks, min(first_us) AS first_us, max(last_us) AS last_us
+                     FROM staged GROUP BY twin),
+           moved AS (UPDATE head SET seq = head.seq + taken.n, samples = head.samples + taken.n,
+                     first_us = least(head.first_us, taken.first_us), last_us = taken.last_us,
+                     small_chunks = head.small_chunks + taken.chunks, small_rows = head.small_rows + taken.n
+                     FROM taken WHERE head.twin = taken.twin AND (head.last_us IS NULL OR head.last_us < taken.first_us)
+                     RETURNING head.twin)
+           INSERT INTO chunk ({names}) SELECT {names} FROM staged WHERE twin IN (SELECT twin FROM moved) ORDER BY last_seq"""
+"""What a head has passed is in the archive and does not enter it again."""
+FEW = 4
+"""So many segments go along with the statement itself: a stage costs more than it saves."""
+
+
+class Stage:
+    """What waits in the transaction of one connection."""
+
+    def __init__(self, driver: "psycopg.Connection[Any]") -> None:
+        """Hold nothing."""
+        self._driver = driver
+        self._heads: dict[int, Head] = {}
+        self._rows: list[Row] = []
+        self._turn: int | None = None
+        self._is_used = False
+
+    def begin(self, twins: Iterable[int]) -> None:
+        """Lock the heads of these twins, in one order everywhere so that nobody waits in a circle."""
+        found = self._driver.execute(LOCK, (sorted(twins),), binary=True)
+        self._heads = {twin: Head(*head) for twin, *head in found}
+
+    def end(self) -> None:
+        """Forget the transaction, whatever became of it."""
+        self._heads, self._rows, self._turn, self._is_used = {}, [], None, False
+
+    def turn(self, twin: int | None) -> None:
+        """Hear whose twin's the next statements are; None: they may concern any."""
+        self._turn = twin
+
+    def head(self, twin: int) -> Head | None:
+        """Return where a twin stands, as long as only segments have been put behind it."""
+        return self._heads.get(twin) if twin == self._turn else None
+
+    def put(self, segment: Row) -> None:
+        """Let a segment wait."""
+        self._rows.append(segment)
+
+    def make_way(self) -> None:
+        """Let other statements find what was put here of the twin whose turn it is, and move its head."""
+        if self._turn is None or any(row[0] == self._turn for row in self._rows):
+            self.flush()
+        if self._turn is None:
+            self._heads.clear()
+        else:
+            self._heads.pop(self._turn, None)
+
+    def flush(self) -> None:
+        """Store what waits."""
+        rows, self._rows = self._rows, []
+        if not rows:
+            return
+        names = ", ".join(COLUMNS)
+        if len(rows) <= FEW:
+            place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"
+            source = f"VALUES {', '.join([place] * len(rows))}"
+            self._driver.execute(STORE.format(names=names, source=source), list(chain(*rows)))
+            return
+        self._driver.execute("TRUNCATE stage" if self._is_used else MAKE)
+        self._is_used = True
+        with self._driver.cursor().copy("COPY stage FROM STDIN (FORMAT BINARY)") as copy:
+            copy.set_types(list(COLUMNS.values()))
+            for row in rows:
+                copy.write_row(row)
+        self._driver.execute(STORE.format(names=names, source=f"SELECT {names} FROM stage"))

@@ -1,0 +1,1 @@
+"""Xija models (JSON), as they fly at the Chandra observatory."""
