@@ -68,7 +68,7 @@ class Finding:
     @property
     def foresight(self) -> float:
         """Error on what they were not fitted to, after over before."""
-        return 1.0 if self.judged.validation is None else self.judged.validation.foresight
+        return foresight_of(self.judged)
 
     def without(self, place: object, worth_of_it: float, trial: Trial) -> "Finding":
         """Return the finding without its effect at a place, whose log Bayes factor was ``worth_of_it``, if it has one."""
@@ -249,6 +249,11 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
     close = [j for j in judged if j is judged[0] or is_close(j, judged[0])]
     rest = [j for j in judged if all(j is not c for c in close)]
     return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
+
+
+def foresight_of(judged: Judged) -> float:
+    """Return the error on what an option was not fitted to, after over before; one where nobody has looked."""
+    return 1.0 if judged.validation is None else judged.validation.foresight
 
 
 def worth(judged: Judged) -> float:

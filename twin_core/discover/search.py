@@ -13,11 +13,14 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
+from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import by_chance, least_explained, stands
+from twin_core.discover.complete import complete
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
+    NO_LAW,
     NO_MORE,
     OUTDONE,
     SMALL_REMAINDER,
@@ -26,6 +29,7 @@ from twin_core.discover.judge import (
     Search,
     accept,
     examine,
+    foresight_of,
     once_each,
     threshold,
     worth,
@@ -98,35 +102,64 @@ def search(
             state.join(before)
         elif not extended:
             break
+        complete(state, needed)
         prune(state, needed)
     withdraw(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         _extend(state, needed, fallback=True)
         withdraw(state, needed)
-        _name_what_leaves_little(state, needed)
+    reconsider(state, needed)
+    progress(0.95, "comparing what was found with other names")
+    tell_alternatives(state, needed)
     return state
 
 
-def _name_what_leaves_little(state: Search, needed: float) -> None:
-    """Where nothing is named, name the likeliest option that was refused for what little a coarse network leaves.
+def reconsider(state: Search, needed: float) -> None:
+    """Name an option that was refused for the heat that it leaves, if what was found instead is no better.
 
-    If it stands, and predicts what it was not fitted to better than the heat without a name that was found instead; where both
-    predict alike, the likelier one counts.
+    What it leaves is little, and nothing or a heat without a name was found; or it leaves much, and a name was found that
+    leaves no such heat and yet is less likely and predicts worse: whichever law holds there, that one does not.
     """
-    near = [j for j in state.rejected if j.reason == SMALL_REMAINDER and len(j.trial.effects) == len(j.effects)]
+    if len(state.findings) > 1:
+        return
+    is_named = any(not effect.fallback for finding in state.findings for effect in finding.effects)
+    reasons = (SMALL_REMAINDER, NO_LAW) if is_named else (SMALL_REMAINDER,)
+    near = [j for j in state.rejected if j.reason in reasons and len(j.trial.effects) == len(j.effects)]
+    if is_named:
+        near = [
+            j for j in near if all(worth(j) < worth(f.judged) and foresight_of(j) < f.foresight for f in state.findings)
+        ]
     if not near:
         return
     best = min(near, key=worth)
     rest = [j for j in state.rejected if j.effects != best.effects]
     named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
     withdraw(named, needed)
-    if named.findings and all(_is_better(named.findings[0], heat) for heat in state.findings):
+    if named.findings and all(_is_better(named.findings[0], other) for other in state.findings):
+        if is_named:
+            named.rejected += [replace(f.judged, reason=OUTDONE) for f in state.findings]
         state.join(named)
 
 
+def tell_alternatives(state: Search, needed: float) -> None:
+    """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more."""
+    for i, finding in enumerate(state.findings):
+        kept = _attempted_without(state, {effect.place for effect in finding.effects})
+        if kept is None:
+            continue
+        compared = state.attempt(
+            partial(add_coarse_alternatives, state, kept[0], finding, needed),
+            f"alternatives to {finding.judged.labels}",
+        )
+        if compared is not None:
+            state.findings[i] = compared
+            told = {e.place for option in compared.alternatives for e in option.effects}
+            state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in told)]
+
+
 def _is_better(name: Finding, heat: Finding) -> bool:
-    """Return whether a name predicts better than a heat without one, or is likelier where chance tells them apart no further."""
+    """Return whether a name predicts better than what was found, or is likelier where chance tells them apart no further."""
     if heat.foresight * policy.FORESIGHT <= name.foresight <= heat.foresight / policy.FORESIGHT:
         return worth(name.judged) < worth(heat.judged)
     return name.foresight < heat.foresight
@@ -152,10 +185,13 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback, beside=beside)
     seen = state.attempt(second, f"{what}, by open-loop residuals")
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
+    refused = [*by_trajectory.rejected, *by_heat.rejected[len(state.rejected) :]]
     if not options:
-        state.rejected = by_trajectory.rejected + by_heat.rejected[len(state.rejected) :]
+        state.rejected = refused
         return False
     state.join(min(options, key=lambda fork: fork.findings[-1].foresight))
+    named = {effect.place for effect in state.findings[-1].effects}
+    state.rejected = [j for j in refused if {effect.place for effect in j.effects} != named]
     return True
 
 
@@ -312,9 +348,14 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
         return
     option = replace(finding.judged, trial=state.trial)
     examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
-    if examined is not None and examined[0].reason not in ("", SMALL_REMAINDER):
-        state.rejected.append(examined[0])
-        _drop(state, places, *without)
+    if examined is None:
+        return
+    if examined[0].reason in ("", SMALL_REMAINDER):
+        again = replace(finding, judged=replace(finding.judged, validation=examined[0].validation))
+        state.findings = [again if f is finding else f for f in state.findings]
+        return
+    state.rejected.append(examined[0])
+    _drop(state, places, *without)
 
 
 def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:

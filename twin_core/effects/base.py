@@ -72,7 +72,7 @@ class Quality:
     def transform(self) -> Transform:
         """How a solver moves it."""
         if self.positive:
-            return Log()
+            return Log(np.inf if self.upper is None else self.upper)
         if self.leap is not None:
             return Shifted(0.0, self.leap)
         if self.lower is None and self.upper is None:
@@ -259,6 +259,10 @@ class Effect(ABC):
 
     def refined(self, survey: Survey) -> Iterable[Self]:
         """Yield starts between this one and its neighbours, where ``starts`` is too coarse for a local search; or none."""
+        return ()
+
+    def completed(self, survey: Survey) -> Iterable[Self]:
+        """Yield the fitted effect with what it may also have and its simplest form lacks, such as an end; most have no more."""
         return ()
 
     def centred(self, survey: Survey) -> Self:

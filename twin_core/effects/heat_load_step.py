@@ -2,11 +2,12 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Quality, Where
+from twin_core.effects.base import Quality, Survey, Where
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
@@ -49,6 +50,12 @@ class HeatLoadStep(OnsetEffect):
         amplitude, onset = super().qualities()
         end = (replace(onset, name="stop"),) if "stop" in self.values else ()
         return (amplitude, onset, *end)
+
+    def completed(self, survey: Survey) -> Iterable[Self]:
+        """Yield the load with an end, at the instants of ``starts`` after it came on."""
+        if "stop" not in self.values:
+            instants = (e.values["time"] for e in self.starts(self.where, survey))
+            yield from (self.with_values({"stop": end}) for end in instants if end > self.values["time"])
 
     def addition(self, layout: Layout) -> Addition:
         """Return the heat."""

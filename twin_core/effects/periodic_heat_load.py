@@ -14,6 +14,9 @@ from twin_core.parameters.parameter import Parameter
 
 N_PEAKS = 6
 SAMPLES_PER_PERIOD = 4.0
+LEAST_PERIODS = 2.0
+"""What went through fewer of its periods has not come back once: a slow change is no period."""
+
 FINER = 4
 """The spectrum is read at a spacing this much finer than one over the record's length."""
 
@@ -52,12 +55,12 @@ class PeriodicHeatLoad(Effect):
     sentence = "a periodic heat load on {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return mean, both amplitudes and the period."""
+        """Return mean, both amplitudes and the period, which is no longer than the record that it was found in can tell."""
         return (
             Quality("Q_W", "W", null=0.0),
             Quality("A_W", "W", null=0.0),
             Quality("B_W", "W", null=0.0),
-            Quality("P_s", "s", positive=True, prior_std=1.0),
+            Quality("P_s", "s", positive=True, prior_std=1.0, upper=self.settings.get("longest_s")),
         )
 
     def addition(self, layout: Layout) -> Addition:
@@ -73,9 +76,16 @@ class PeriodicHeatLoad(Effect):
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
         """Yield the null effect at the periods that stand out in what the node's sensors, or all, read beyond the model."""
-        settings = {"origin_s": survey.begin_s, "dated": survey.dated}
+        window = longest_segment(survey)
+        span_s = float(np.ptp(survey.along.time_s[window]))
+        settings = {"origin_s": survey.begin_s, "dated": survey.dated, "longest_s": span_s / LEAST_PERIODS}
         for period in standing_out_s(survey, where["node"]):
             yield cls(where, {"Q_W": 0.0, "A_W": 0.0, "B_W": 0.0, "P_s": period}, settings)
+
+
+def longest_segment(survey: Survey) -> slice:
+    """Return the points of the segment that lasts longest."""
+    return max(survey.segments(), key=lambda s: survey.along.time_s[s.stop - 1] - survey.along.time_s[s.start])
 
 
 def standing_out_s(survey: Survey, node: str) -> list[float]:
@@ -93,7 +103,7 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     """
     from scipy.signal import find_peaks  # loads scipy.stats: half a second that few need
 
-    window = max(survey.segments(), key=lambda s: survey.along.time_s[s.stop - 1] - survey.along.time_s[s.start])
+    window = longest_segment(survey)
     spec = survey.layout.spec
     own = [i for i, sensor in enumerate(spec.sensors) if survey.layout.sensor_node(sensor) == node]
     time_s, residual = survey.along.time_s[window], survey.residual_K[window][:, own or slice(None)]
@@ -103,7 +113,7 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     step = float(grid_s[1] - grid_s[0])
     frequency = np.fft.rfftfreq(FINER * grid_s.size, step)
     power = (np.abs(np.fft.rfft(even, FINER * grid_s.size, axis=0)) ** 2).sum(axis=1)
-    seen = (frequency * (grid_s[-1] - grid_s[0]) >= 1.0) & (frequency * step <= 1.0 / SAMPLES_PER_PERIOD)
+    seen = (frequency * (grid_s[-1] - grid_s[0]) >= LEAST_PERIODS) & (frequency * step <= 1.0 / SAMPLES_PER_PERIOD)
     found: list[int] = []
     for spectrum in (power, power * frequency**2):
         peaks, _ = find_peaks(np.where(seen, spectrum, 0.0))

@@ -123,15 +123,21 @@ class Bounded:
 
 @dataclass(frozen=True)
 class Log:
-    """value = exp(free): a positive quantity of unknown order of magnitude."""
+    """value = exp(free): a positive quantity of unknown order of magnitude, up to a bound if there is one."""
+
+    upper: float = np.inf
 
     lowest: ClassVar[float] = -np.inf
-    highest: ClassVar[float] = np.inf
     leap: ClassVar[float] = np.inf
 
+    @property
+    def highest(self) -> float:
+        """The logarithm of the bound."""
+        return float(np.log(self.upper))
+
     def to_value(self, free: float) -> float:
-        """Return exp(free), held within e^-300 and e^300 so that a wild trial step stays a number."""
-        return float(np.exp(np.clip(free, -300.0, 300.0)))
+        """Return exp(free) up to the bound, held within e^-300 and e^300 so that a wild trial step stays a number."""
+        return min(float(np.exp(np.clip(free, -300.0, 300.0))), self.upper)
 
     def to_free(self, value: float) -> float:
         """Return ln(value)."""

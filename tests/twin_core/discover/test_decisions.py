@@ -44,7 +44,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import _name_what_leaves_little, exchange, withdraw
+from twin_core.discover.search import exchange, reconsider, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -427,14 +427,35 @@ def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
 ) -> None:
     state = Search(stub(), stub())
     if foresight is not None:
-        state.findings = [Finding(judged("f", nats, foresight=foresight))]
+        state.findings = [Finding(replace(judged("f", nats, foresight=foresight), effects=(unnamed(),)))]
     likely, less = (replace(judged(node, nats), reason=SMALL_REMAINDER) for node, nats in (("a", 90.0), ("b", 60.0)))
     state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
-    _name_what_leaves_little(state, NEEDED)
-    assert [f.effects[0].where["node"] for f in state.findings] == names
+    reconsider(state, NEEDED)
     named = names == ["a"]
+    assert [effect.fallback for f in state.findings for effect in f.effects] == [not named]
     assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
     assert (state.trial is likely.trial) == named
+
+
+@pytest.mark.parametrize(
+    ("nats", "foresight", "names"),
+    [
+        (90.0, 0.5, ["a"]),
+        (60.0, 0.5, ["f"]),
+        (90.0, 0.7, ["f"]),
+    ],
+    ids=["likelier and predicts better", "less likely", "predicts worse"],
+)
+def test_no_name_stands_that_one_refused_for_what_it_leaves_excels(
+    nats: float, foresight: float, names: list[str]
+) -> None:
+    """Whichever law holds there, a name that is less likely and predicts worse than one that is no law does not."""
+    found = judged("f", 70.0, foresight=0.6)
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=NO_LAW)]
+    reconsider(state, NEEDED)
+    assert [f.effects[0].where["node"] for f in state.findings] == names
+    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [NO_LAW])
 
 
 def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
@@ -474,7 +495,7 @@ def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
     state = Search(stub(), stub())
     option = judged("a", 90.0)
     state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=SMALL_REMAINDER)]
-    _name_what_leaves_little(state, NEEDED)
+    reconsider(state, NEEDED)
     assert not state.findings
 
 

@@ -34,7 +34,23 @@ def test_a_line_in_the_residual_is_a_period_to_start_from(node: str, period_s: f
     assert 6 <= len(starts) <= 12
     nearest = min(abs(1.0 / e.values["P_s"] - 1.0 / period_s) for e in starts)
     assert nearest < 0.25 / (t[-1] - t[0])
-    assert all(e.values["P_s"] <= t[-1] - t[0] + 1e-6 for e in starts)
+    assert all(e.values["P_s"] <= (t[-1] - t[0]) / 2.0 + 1e-6 for e in starts)
+
+
+def test_what_has_not_come_back_once_is_no_period() -> None:
+    """A slow change as long as the record is no line, and no fit may stretch a period beyond half of it."""
+    network = every_term_network()
+    along = points(network, 400)
+    span_s = float(np.ptp(along.time_s))
+    slow = np.sin(2.0 * np.pi * along.time_s / (1.2 * span_s))[:, None] * np.ones((1, 2))
+    noise = np.random.default_rng(2).normal(0.0, 0.05, slow.shape)
+    starts = list(LOAD.starts({"node": "a"}, replace(survey_of(network, along), residual_K=slow + noise)))
+    assert starts
+    for effect in starts:
+        period = next(q for q in effect.qualities() if q.name == "P_s")
+        assert effect.values["P_s"] <= span_s / 2.0
+        assert period.transform.to_value(np.log(span_s)) == pytest.approx(span_s / 2.0)
+        assert period.transform.highest == pytest.approx(np.log(span_s / 2.0))
 
 
 def test_its_phase_counts_from_the_first_sample() -> None:

@@ -1,0 +1,68 @@
+"""Alternatives: names that a network which is visibly coarse cannot tell from the one that was found.
+
+Evidence compares readings with their noise. What a coarse network leaves beside any name is no noise: it leans towards one
+name or another by many nats that say nothing. There, names that explain as much are alternatives, as are those that the evidence
+itself hardly tells from the best one.
+"""
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+from twin_core.discover import policy
+from twin_core.discover.coarseness import by_chance
+from twin_core.discover.confirm import Trial, about_trajectory, mean_excess, try_on_trajectories, weigh
+from twin_core.discover.judge import Finding, Judged, Search, worth
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, screened
+from twin_core.effects.base import Effect
+
+N_COMPARED = 8
+"""Other names, no less simple, that are fitted at most, the best ones by linear screening first."""
+
+
+def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, needed: float) -> Finding:
+    """Return a finding of one name with the names that explain as much of what it explains, where the network is coarse.
+
+    Parameters
+    ----------
+    state
+        With the finding.
+    simple
+        The state's model without it.
+    finding
+        Of a single effect that has a name; others are returned as they are.
+    needed
+        Log Bayes factor that is asked for.
+    """
+    left = mean_excess(state.trial)
+    own = finding.effects[0]
+    if len(finding.effects) != 1 or own.fallback or left <= by_chance(state.trial.n_samples):
+        return finding
+    least = (1.0 - policy.REPEATABLE_SHARE) * (mean_excess(simple) - left)
+    known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
+    calibration = simple.calibration()
+    about = about_trajectory(calibration.problem, calibration.optimum)
+    probes = best_of_each_place(
+        screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
+    )
+    gains = {p.effect.place: p.gain for p in probes if len(p.effect.qualities()) <= len(own.qualities())}
+    near = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
+    others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= near]
+
+    def compared(effect: Effect) -> Judged | None:
+        work = partial(_explaining, state, simple, effect, least, needed)
+        return state.attempt(work, f"{effect.label} instead of {own.label}")
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        told = [j for j in pool.map(compared, others[:N_COMPARED]) if j is not None]
+    return Finding(finding.judged, (*finding.alternatives, *sorted(told, key=worth)))
+
+
+def _explaining(state: Search, simple: Trial, effect: Effect, least: float, needed: float) -> Judged | None:
+    """Return an effect on top of a trial if it is supported and explains at least so much of the misfit."""
+    trial = try_on_trajectories(simple, (*simple.present_effects, effect))
+    if trial is None or mean_excess(simple) - mean_excess(trial) < least:
+        return None
+    own = tuple(e for e in trial.effects if e.place == effect.place)
+    evidence = weigh(simple, trial, max(state.n_named, 1))
+    return Judged(own, evidence, trial) if evidence.log_bayes_factor > needed else None
