@@ -349,12 +349,19 @@ function renderModels() {
 // ---- what the operator does
 
 // Shows a version beside the active one; true if the operator wants the switch.
+let withdraw = () => {};
 function agreed(model) {
   const dialog = $("activate-dialog"), worse = drawComparison($("compare"), state.models.find((m) => m.active), model);
+  withdraw();  // a question that was closed, the event of which has not come yet
   $("activate-title").textContent = worse || `Activate version ${model.version}?`;
   dialog.returnValue = "";
   dialog.showModal();
-  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue === "yes"), { once: true }));
+  return new Promise((resolve) => {
+    const answer = (yes) => { dialog.removeEventListener("close", closed); resolve(yes); };
+    const closed = () => dialog.open || answer(dialog.returnValue === "yes");  // open: the event of the question before
+    withdraw = () => answer(false);
+    dialog.addEventListener("close", closed);
+  });
 }
 
 // Compares a plan with the forecast; a plan that the service refuses leaves everything as it was.
