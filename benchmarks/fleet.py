@@ -22,7 +22,7 @@ import numpy as np
 import psycopg
 
 from benchmarks.markdown import markdown_table, save_table
-from service.store import jobs, ownership, samples, twins
+from service.store import appending, jobs, ownership, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -65,7 +65,7 @@ def through_the_store(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
     done = threading.Semaphore(0)
     begun = time.perf_counter()
     for twin, batch in work:
-        database.submit_to(twin, lambda result, error: done.release(), samples.append, twin, batch)
+        database.submit_to(twin, lambda result, error: done.release(), appending.append, twin, batch)
     for _ in work:
         done.acquire()
     elapsed_s = time.perf_counter() - begun

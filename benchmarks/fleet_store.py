@@ -15,7 +15,7 @@ import psycopg
 
 from benchmarks.fleet import CHANNELS, batches, copied_and_merged, specification, through_the_store
 from benchmarks.markdown import markdown_table, save_table
-from service.store import retention, samples, twins
+from service.store import appending, retention, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -49,9 +49,9 @@ def partitioned(server: Server, span_us: int, count: int) -> None:
 @contextlib.contextmanager
 def one_by_one() -> Iterator[None]:
     """Let the store insert every batch by itself, as it does with large ones."""
-    usual, samples.STAGED_BYTES = samples.STAGED_BYTES, 0
+    usual, appending.STAGED_BYTES = appending.STAGED_BYTES, 0
     yield
-    samples.STAGED_BYTES = usual
+    appending.STAGED_BYTES = usual
 
 
 def ingest(server_url: str, rows: int, count: int) -> list[float]:
@@ -80,7 +80,7 @@ def fill(database: Database, server: Server) -> None:
         def write(connection: Connection, key: int = key) -> None:
             for day in range(DAYS):
                 seq = np.arange(1, ROWS_A_DAY + 1) + day * ROWS_A_DAY
-                samples.insert(connection, key, seq, Batch(day * DAY_US + steps_us, values, day * DAY_US + steps_us))
+                segments.insert(connection, key, seq, Batch(day * DAY_US + steps_us, values, day * DAY_US + steps_us))
             connection.execute(
                 "UPDATE head SET seq = ?, samples = ?, first_us = 0, last_us = ? WHERE twin = ?",
                 (DAYS * ROWS_A_DAY, DAYS * ROWS_A_DAY, DAYS * DAY_US - 1, key),

@@ -12,6 +12,7 @@ from psycopg import errors
 
 from service.store.connection import Connection, Cursor
 from service.store.errors import DiskFull, StoreError, Unavailable
+from service.store.postgres import partitions
 from service.store.postgres.migrations import migrate
 from service.store.postgres.stage import Stage
 
@@ -121,6 +122,7 @@ class PostgresSession:
     def roll_back(self) -> None:
         """Undo it; a connection that cannot even do that is given up."""
         self._stage.end()
+        self._stage.rooms.clear()
         try:
             self._speaking.driver.execute("ROLLBACK")
         except psycopg.Error:
@@ -139,7 +141,11 @@ class PostgresSession:
 
     def _speak(self) -> None:
         self._speaking = Speaking(connect(self._url))
-        self._stage = self._speaking.stage = Stage(self._speaking.driver)
+        self._stage = self._speaking.stage = Stage(self._speaking.driver, self._make_rooms)
+
+    def _make_rooms(self, instants: Iterable[int]) -> dict[str, tuple[int, int]]:
+        with connect(self._url) as driver:  # not in the transaction that is open: its locks would be waited for
+            return partitions.make(Speaking(driver), instants)
 
 
 class PostgresEngine:
@@ -198,8 +204,8 @@ class PostgresEngine:
                 speaking.driver.close()
 
     def is_passing(self, error: Exception) -> bool:
-        """Return whether transactions stood in each other's way."""
-        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure)
+        """Return whether transactions stood in each other's way, or a partition was dropped that a segment was to go into."""
+        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure | errors.CheckViolation)
 
     def refusal(self, error: Exception) -> Exception:
         """Return what the caller is told about a fault."""
@@ -218,6 +224,14 @@ class PostgresEngine:
                 f"SELECT setval(pg_get_serial_sequence('{table}', '{column}'), greatest(max({column}), 1)) FROM {table}"
             )
             connection.execute(query)
+
+    def drop_old(self) -> int:
+        """Drop a quarter of which no twin keeps anything, on a connection that holds no locks."""
+        try:
+            with connect(self.url) as driver:
+                return partitions.drop_one(Speaking(driver))
+        except psycopg.Error as error:
+            raise self.refusal(error) from None
 
     def close(self) -> None:
         """Close the readers' connections."""

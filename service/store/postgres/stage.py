@@ -1,6 +1,6 @@
 """Segments of many twins on their way into one table: COPY into a stage, then one INSERT … SELECT that moves the heads, too."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import chain
 from typing import Any
 
@@ -25,6 +25,8 @@ STORE = """WITH staged ({names}) AS ({source}),
                      RETURNING head.twin)
            INSERT INTO chunk ({names}) SELECT {names} FROM staged WHERE twin IN (SELECT twin FROM moved) ORDER BY last_seq"""
 """What a head has passed is in the archive and does not enter it again."""
+Rooms = dict[str, tuple[int, int]]
+"""Partitions and the instants, start <= first_us < stop, that they are for."""
 FEW = 4
 """So many segments go along with the statement itself: a stage costs more than it saves."""
 
@@ -32,9 +34,10 @@ FEW = 4
 class Stage:
     """What waits in the transaction of one connection."""
 
-    def __init__(self, driver: "psycopg.Connection[Any]") -> None:
-        """Hold nothing."""
-        self._driver = driver
+    def __init__(self, driver: "psycopg.Connection[Any]", make: Callable[[Iterable[int]], Rooms]) -> None:
+        """Hold nothing; ``make`` makes partitions for segments that begin at some instants, and tells which there are."""
+        self._driver, self._make = driver, make
+        self.rooms: Rooms = {}
         self._heads: dict[int, Head] = {}
         self._rows: list[Row] = []
         self._turn: int | None = None
@@ -57,6 +60,14 @@ class Stage:
         """Return where a twin stands, as long as only segments have been put behind it."""
         return self._heads.get(twin) if twin == self._turn else None
 
+    def make_room(self, instants: Iterable[int]) -> None:
+        """Make the partitions that segments need which begin at some instants, as far as they are not known to be there."""
+        missing = [t for t in instants if not any(first <= t < stop for first, stop in self.rooms.values())]
+        if missing:
+            self.rooms = self._make(missing)
+            name = next(name for name, (first, stop) in self.rooms.items() if first <= missing[0] < stop)
+            self._driver.execute(f"SELECT FROM {name} LIMIT 0")  # type: ignore[arg-type]  # a lock, with which news is heard
+
     def put(self, segment: Row) -> None:
         """Let a segment wait."""
         self._rows.append(segment)
@@ -75,6 +86,7 @@ class Stage:
         rows, self._rows = self._rows, []
         if not rows:
             return
+        self.make_room(row[2] for row in rows)
         names = ", ".join(COLUMNS)
         if len(rows) <= FEW:
             place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.instants import now_us
-from service.store import events, samples, twins
+from service.store import appending, events, samples, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database, _settle
@@ -47,7 +47,7 @@ def together(database: Database, orders: Sequence[Operation]) -> list[Any]:
 
 
 def appended(connection: Connection, twin: int, batch: Batch) -> tuple[list[int], int, int | None]:
-    receipt = samples.append(connection, twin, batch)
+    receipt = appending.append(connection, twin, batch)
     return receipt.status.tolist(), receipt.first_seq, receipt.last_us
 
 
@@ -121,7 +121,7 @@ def test_what_a_head_has_passed_does_not_enter_again(postgres: str) -> None:
 
     def twice(connection: Any, twin: int) -> None:
         for _ in range(2):
-            connection.stage.put(samples._segment(twin, time_us + 1, batch))
+            connection.stage.put(segments.segment(twin, time_us + 1, batch))
             connection.stage.flush()
 
     together(database, [(1, twice, ())])
