@@ -12,7 +12,7 @@ from service.store.blobs import matrix
 from service.store.connection import Connection, Head, Stage
 from service.store.errors import TwinGone
 from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
-from service.store.quarters import divided
+from service.store.quarters import divided, quarter_of
 from service.store.segments import MOST_SMALL_CHUNKS, MOST_SMALL_ROWS, SMALL, WITHIN, within
 
 STAGED_BYTES = 1900
@@ -58,29 +58,34 @@ class Receipt:
 def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
     """Store what is new in a batch."""
     time_us = batch.time_us
-    if time_us.size and bool((time_us[1:] > time_us[:-1]).all()):
+    n = time_us.size
+    if n == 1 or (n and bool((time_us[1:] > time_us[:-1]).all())):
         stage: Stage | None = getattr(connection, "stage", None)
-        if stage is not None and 8 * (batch.values.size + 3 * time_us.size) < STAGED_BYTES:
+        if stage is not None and 8 * (batch.values.size + 3 * n) < STAGED_BYTES:
             known = stage.head(twin)
             if known is not None and (known.last_us is None or known.last_us < time_us[0]):
-                return _put(connection, stage, known, twin, batch)
-        head = _advance(connection, twin, batch, int(time_us.size), after_all=True)
+                return _put(stage, known, twin, batch)
+        head = _advance(connection, twin, batch, n, after_all=True)
         if head is not None:
             _write(connection, twin, batch, head)
-            return Receipt(np.zeros(time_us.size, dtype=np.int8), head[0] - int(time_us.size) + 1, int(time_us[-1]))
+            return Receipt(np.zeros(n, dtype=np.int8), head[0] - n + 1, int(time_us[-1]))
     return _merge_in(connection, twin, batch)
 
 
-def _put(connection: Connection, stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
+def _put(stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
     """Store a small batch that comes after everything that is stored, together with those of other twins."""
-    n, first_seq, last_us = int(batch.time_us.size), head.seq + 1, int(batch.time_us[-1])
-    head.seq, head.last_us = head.seq + n, last_us
-    seq, parts = np.arange(first_seq, first_seq + n), divided(batch.time_us)
-    head.small_chunks, head.small_rows = head.small_chunks + len(parts), head.small_rows + n
-    for part in parts:
-        stage.put(segments.segment(twin, seq[part], batch.take(part)))
+    n, first_seq, first_us, last_us = batch.time_us.size, head.seq + 1, int(batch.time_us[0]), int(batch.time_us[-1])
+    head.seq, head.last_us, head.small_rows = head.seq + n, last_us, head.small_rows + n
+    seq = np.arange(first_seq, head.seq + 1)
+    if quarter_of(first_us) == quarter_of(last_us):
+        stage.put(segments.packed(twin, (first_us, last_us, head.seq), seq, batch))
+        head.small_chunks += 1
+    else:
+        for part in divided(batch.time_us):
+            stage.put(segments.segment(twin, seq[part], batch.take(part)))
+            head.small_chunks += 1
     if head.small_chunks >= MOST_SMALL_CHUNKS or head.small_rows >= MOST_SMALL_ROWS:
-        segments.compact(connection, twin, values_rows=batch.values.shape[0])
+        stage.compact_later(twin, batch.values.shape[0])
     return Receipt(np.zeros(n, dtype=np.int8), first_seq, last_us)
 
 
@@ -133,7 +138,7 @@ def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int
     n = int(batch.time_us.size)
     segments.insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch)
     if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
-        segments.compact(connection, twin, values_rows=batch.values.shape[0])
+        segments.compact(connection, {twin: batch.values.shape[0]})
 
 
 def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

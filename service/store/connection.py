@@ -59,3 +59,6 @@ class Stage(Protocol):
 
     def put(self, segment: Row) -> None:
         """Store a segment that lies behind all of its twin, moving the twin's head: at the latest with the commit."""
+
+    def compact_later(self, twin: int, n_rows: int) -> None:
+        """Let the small segments of a twin, of so many rows, be compacted with the commit."""

@@ -6,8 +6,9 @@ a segment are of one quarter, so that a database may keep each quarter by itself
 several, and how long that is at most, the twin's ``head.reach_us`` tells.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,16 +36,16 @@ def within(twin: int, start: int, stop: int) -> tuple[int, ...]:
     return (twin, start, stop, start_us(quarter_of(start)), twin)
 
 
+_WHOLE, _REAL = np.dtype("<i8"), np.dtype("<f8")
 _INSERT = """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
              VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"""
 
 
-def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
-    """Store samples, a segment for each quarter; the head of the archive has been moved already."""
+def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> list[int]:
+    """Store samples, a segment for each quarter, and return their sizes; the head of the archive has been moved already."""
     parts = divided(batch.time_us)
     make_room(connection, [int(batch.time_us[part].min()) for part in parts])
-    for part in parts:
-        _insert(connection, twin, seq[part], batch.take(part))
+    return [_insert(connection, twin, seq[part], batch.take(part)) for part in parts]
 
 
 def make_room(connection: Connection, instants: Iterable[int]) -> None:
@@ -54,7 +55,7 @@ def make_room(connection: Connection, instants: Iterable[int]) -> None:
         stage.make_room(instants)
 
 
-def _insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
+def _insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> int:
     has_outline = batch.time_us.size >= outline.PIECE
     row = connection.execute(
         _INSERT + " RETURNING id" if has_outline else _INSERT,  # to return it costs a tenth of a small batch
@@ -62,20 +63,25 @@ def _insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Ba
     )
     if has_outline:
         outline.put(connection, "chunk", int(row.fetchone()[0]), batch.time_us, batch.values)
+    return int(batch.time_us.size)
 
 
 def segment(twin: int, seq: NDArray[np.int64], batch: Batch) -> Row:
     """Return a batch as a row of the table of chunks."""
+    ends = (int(batch.time_us.min()), int(batch.time_us.max()), int(seq.max()))
+    return packed(twin, ends, seq, batch)
+
+
+def packed(twin: int, ends: tuple[int, int, int], seq: NDArray[np.int64], batch: Batch) -> Row:
+    """The same where (first instant, last instant, last number) are known: to look for them is half of a small batch's cost."""
     return (
         twin,
-        int(batch.time_us.size),
-        int(batch.time_us.min()),
-        int(batch.time_us.max()),
-        int(seq.max()),
-        np.ascontiguousarray(seq, dtype="<i8").data,
-        np.ascontiguousarray(batch.time_us, dtype="<i8").data,
-        np.ascontiguousarray(batch.values, dtype="<f8").data,
-        None if batch.received_us is None else np.ascontiguousarray(batch.received_us, dtype="<i8").data,
+        batch.time_us.size,
+        *ends,
+        seq.astype(_WHOLE, copy=False).tobytes(),
+        batch.time_us.astype(_WHOLE, copy=False).tobytes(),
+        batch.values.astype(_REAL, copy=False).tobytes(),
+        None if batch.received_us is None else batch.received_us.astype(_WHOLE, copy=False).tobytes(),
     )
 
 
@@ -100,25 +106,44 @@ def joined(batches: Sequence[Batch], n_rows: int) -> Batch:
     return Batch(np.concatenate(times), np.concatenate(values, axis=1), np.concatenate(received))
 
 
-def compact(connection: Connection, twin: int, values_rows: int) -> None:
-    """Rewrite the small chunks in the order of time, cut where time makes a jump, so that none spans idle years."""
-    rows = connection.execute(
-        "SELECT id, first_us, seq, time, value, received FROM chunk WHERE twin = ? AND n < ? ORDER BY id", (twin, SMALL)
+def compact(connection: Connection, n_rows: Mapping[int, int]) -> None:
+    """Rewrite the small segments of twins in the order of time, cut where time makes a jump, so that none spans idle years.
+
+    Parameters
+    ----------
+    n_rows
+        Twin -> rows of its values.
+    """
+    gone = connection.execute(
+        f"""DELETE FROM chunk WHERE twin IN ({", ".join(map(str, n_rows))}) AND n < ?
+            RETURNING twin, id, seq, time, value, received""",
+        (SMALL,),
     ).fetchall()
-    seq = np.concatenate([np.frombuffer(row[2], dtype="<i8") for row in rows])
-    whole = joined([unpack(values_rows, *row[3:]) for row in rows], values_rows)
+    held: dict[int, list[Row]] = {twin: [] for twin in n_rows}
+    for twin, *row in sorted(gone, key=itemgetter(1)):
+        held[twin].append(tuple(row))
+    counts = []
+    for twin, rows in held.items():
+        sizes = _rewrite(connection, twin, rows, n_rows[twin]) if rows else []
+        counts.append((len(sizes), sum(sizes), twin))
+    connection.executemany("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", counts)
+
+
+def _rewrite(connection: Connection, twin: int, rows: Sequence[Row], n_rows: int) -> list[int]:
+    """Store what segments (id, seq, time, value, received) of a twin held in as few as may be; return the sizes of small ones."""
+    seq = np.concatenate([instants(row[1]) for row in rows])
+    whole = joined([unpack(n_rows, *row[2:]) for row in rows], n_rows)
     steps = np.diff(whole.time_us)
     if (steps < 0).any():
         order = np.argsort(whole.time_us, kind="stable")
         seq, whole = seq[order], Batch(whole.time_us[order], whole.values[:, order], whole.received[order])
         steps = np.diff(whole.time_us)
-    remove(connection, [row[:2] for row in rows])
-    time_us = whole.time_us
+    time_us, sizes = whole.time_us, []
     cuts = np.flatnonzero(steps > max(int(time_us[-1] - time_us[0]) // MOST_CUTS, 1)) + 1
     for first, stop in pairwise([0, *cuts.tolist(), time_us.size]):
-        part = Batch(time_us[first:stop], whole.values[:, first:stop], whole.received[first:stop])
-        insert(connection, twin, seq[first:stop], part)
-    count_small(connection, twin)
+        part = whole.take(slice(first, stop))
+        sizes += insert(connection, twin, seq[first:stop], part)
+    return [size for size in sizes if size < SMALL]
 
 
 def remove(connection: Connection, segments: Iterable[tuple[int, int]]) -> None:

@@ -4,12 +4,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any, TypeVar
 
 import psycopg
 from psycopg import errors
 
+from service.store import segments
 from service.store.connection import Connection, Cursor
 from service.store.errors import DiskFull, StoreError, Unavailable
 from service.store.postgres import partitions
@@ -105,9 +107,10 @@ class PostgresSession:
         """Begin a transaction and lock the heads of these twins."""
         if not self.in_transaction:
             self._connect()
-        self._speaking.execute("BEGIN")
-        if twins:
-            self._stage.begin(twins)
+        with self._speaking.driver.pipeline() if twins else nullcontext():
+            self._speaking.driver.execute("BEGIN")
+            if twins:
+                self._stage.begin(twins)
 
     def turn(self, twin: int | None) -> None:
         """Hear whose twin's the next statements are; None: they may concern any."""
@@ -115,8 +118,10 @@ class PostgresSession:
 
     def commit(self) -> None:
         """Make it durable."""
-        self._stage.flush()
-        self._speaking.driver.execute("COMMIT")
+        if self._stage.due:
+            self._stage.turn(None)
+            segments.compact(self._speaking, self._stage.due)
+        self._stage.flush("COMMIT")
         self._stage.end()
 
     def roll_back(self) -> None:

@@ -38,7 +38,7 @@ DIVIDED = """
 """Segments need no foreign key: the head of their twin is locked when they are written."""
 FORGET_OUTLINES = (
     """CREATE FUNCTION forget_outlines() RETURNS trigger LANGUAGE plpgsql AS
-       'BEGIN DELETE FROM chunk_outline WHERE chunk IN (SELECT id FROM gone); RETURN NULL; END'""",
+       'BEGIN DELETE FROM chunk_outline WHERE chunk = ANY (ARRAY (SELECT id FROM gone WHERE n >= 512)); RETURN NULL; END'""",
     """CREATE TRIGGER forget_outlines AFTER DELETE ON chunk REFERENCING OLD TABLE AS gone
        FOR EACH STATEMENT EXECUTE FUNCTION forget_outlines()""",
 )

@@ -19,7 +19,10 @@ from service.store.postgres.stage import FEW, Stage
 
 TWINS, ROUNDS, ORDERS = 5, 60, 14
 SPEC = {"channels": {"a": {}, "b": {}}}
-HEAD = "SELECT seq, samples, first_us, last_us, small_chunks, small_rows FROM head WHERE twin = ?"
+HEAD = "SELECT seq, samples, first_us, last_us FROM head WHERE twin = ?"
+SMALL = """SELECT small_chunks, small_rows, (SELECT count(*) FROM chunk WHERE twin = head.twin AND n < 512),
+           (SELECT sum(n) FROM chunk WHERE twin = head.twin AND n < 512) FROM head WHERE twin = ?"""
+"""A server compacts with the commit, a file at once: each must have counted what it has."""
 Operation = tuple[int, Callable[..., Any], tuple[Any, ...]]
 
 
@@ -85,9 +88,9 @@ def test_a_server_stores_what_a_file_stores(stores: tuple[Database, Database], m
     sizes: list[int] = []
     flush = Stage.flush
 
-    def counted(stage: Stage) -> None:
+    def counted(stage: Stage, *after: str) -> None:
         sizes.append(len(stage._rows))
-        flush(stage)
+        flush(stage, *after)
 
     monkeypatch.setattr(Stage, "flush", counted)
     generator, newest = np.random.default_rng(0), [-1] * TWINS
@@ -106,6 +109,9 @@ def test_a_server_stores_what_a_file_stores(stores: tuple[Database, Database], m
             )
         )
         assert tuple(heads[0]) == tuple(heads[1])
+        for database in stores:
+            chunks, rows, *really = database.engine.read(lambda c, key=twin: c.execute(SMALL, (key,)).fetchone())
+            assert [chunks, rows] == really and chunks < segments.MOST_SMALL_CHUNKS
         np.testing.assert_array_equal(held[0].time_us, np.arange(newest[twin - 1] + 1) * 1000)
         np.testing.assert_array_equal(held[0].time_us, held[1].time_us)
         np.testing.assert_array_equal(held[0].values, held[1].values)
