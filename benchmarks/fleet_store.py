@@ -183,8 +183,8 @@ def main() -> None:
         tell("of the database's log for it", f"{logs[0]:.0f} kB a quarter", f"{logs[1]:.1f} kB a segment", "")
         database.close()
     note = (
-        f"Ingest: 50 twins, the best of {ROUNDS} runs of each in turn; both sides commit as durably, up to 256 batches at a time. "
-        f"Reads and retention: {TWINS * DAYS:,} segments of {ROWS_A_DAY} samples in 16 quarters, by the statements of the store. "
+        f"Ingest: 50 twins, the best of {ROUNDS} runs of each in turn; both sides commit as durably, up to 256 batches each. "
+        f"Reads and retention: {TWINS * DAYS:,} segments of {ROWS_A_DAY} samples in 16 quarters, by the store's statements. "
         "A quarter is dropped once no twin keeps anything of it, under a lock on the whole table that is given up after a "
         "second; what some twins keep is deleted one by one, beside which ingest goes on, and VACUUM clears up."
     )
