@@ -212,8 +212,7 @@ def screen_sizes(
     for effects, edges, blocks in _portions(fit, survey, candidates):
         n_tried += len(effects)
         for found, (one, basis, residual) in zip(probes, grounds, strict=True):
-            whitened, projected = _projected(one, basis, blocks)
-            size, products, along = np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
+            size, products, along = _products(one, basis, residual, blocks)
             for effect, (a, b) in zip(effects, pairwise(edges), strict=True):
                 probe = _probe(effect, size[a:b], products[a:b, a:b], along[a:b])
                 found += [] if probe is None else [probe]
@@ -262,6 +261,14 @@ def _projected(fit: HeatFit, basis: FloatArray, blocks: Sequence[FloatArray]) ->
     whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
     projected = basis @ (basis.T @ whitened)
     return whitened, np.subtract(whitened, projected, out=projected)
+
+
+def _products(
+    fit: HeatFit, basis: FloatArray, residual: FloatArray, blocks: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return norms of responses, (n_columns,), and products of the projected ones with each other and the residual."""
+    whitened, projected = _projected(fit, basis, blocks)
+    return np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
 
 
 def _probe(effect: Effect, size: FloatArray, products: FloatArray, along: FloatArray) -> Probe | None:
