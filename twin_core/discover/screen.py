@@ -21,8 +21,9 @@ from twin_core.network.terms import Along
 from twin_core.simulate.response import heat_response
 from twin_core.simulate.stages import balance_along
 
-COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 1.6e7
-"""Responses held at once: so many columns, and so many numbers (130 MB): a long record is gone through in portions."""
+COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 2e6
+"""Responses held at once: so many columns, and so many numbers (16 MB, of which some copies exist meanwhile): a long record is
+gone through in portions."""
 
 UNSEEN_SHARE = 1e-4
 """A candidate whose response is this close to what the nuisance parameters can mimic is not told by the data."""
@@ -150,7 +151,7 @@ def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
         whiten(fit.problem, fit.undeclared, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
         for nominal, block in zip(fit.nominals, blocks, strict=True)
     ]
-    return np.concatenate(parts)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
@@ -211,8 +212,7 @@ def screen_sizes(
     for effects, edges, blocks in _portions(fit, survey, candidates):
         n_tried += len(effects)
         for found, (one, basis, residual) in zip(probes, grounds, strict=True):
-            whitened, projected = _projected(one, basis, blocks)
-            size, products, along = np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
+            size, products, along = _products(one, basis, residual, blocks)
             for effect, (a, b) in zip(effects, pairwise(edges), strict=True):
                 probe = _probe(effect, size[a:b], products[a:b, a:b], along[a:b])
                 found += [] if probe is None else [probe]
@@ -259,7 +259,16 @@ def _projected(fit: HeatFit, basis: FloatArray, blocks: Sequence[FloatArray]) ->
     """Return responses in the metric of a fit, (n_rows, n_columns), as they are and projected off a basis."""
     whitened = _whitened(fit, blocks)
     whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
-    return whitened, whitened - basis @ (basis.T @ whitened)
+    projected = basis @ (basis.T @ whitened)
+    return whitened, np.subtract(whitened, projected, out=projected)
+
+
+def _products(
+    fit: HeatFit, basis: FloatArray, residual: FloatArray, blocks: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return norms of responses, (n_columns,), and products of the projected ones with each other and the residual."""
+    whitened, projected = _projected(fit, basis, blocks)
+    return np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
 
 
 def _probe(effect: Effect, size: FloatArray, products: FloatArray, along: FloatArray) -> Probe | None:
