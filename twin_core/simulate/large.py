@@ -84,6 +84,17 @@ def _add_changed(row: IntArray, column: IntArray, entry: FloatArray, weight: Flo
 
 
 @njit(cache=True, nogil=True)
+def _mix(
+    divided: FloatArray, early: FloatArray, late: FloatArray, mode: FloatArray, pushed: FloatArray, out: FloatArray
+) -> None:
+    """Write how the end of a step answers in mode i to a change of A from mode j to i, (n, n), in one pass over memory."""
+    for i in range(early.size):
+        for j in range(early.size):
+            out[i, j] = (divided[0, i, j] - early[i]) * mode[0, j] - late[i] * mode[1, j]
+            out[i, j] += divided[1, i, j] * pushed[0, j] + divided[2, i, j] * pushed[1, j]
+
+
+@njit(cache=True, nogil=True)
 def _turn(
     turned: IntArray,
     row: IntArray,
@@ -155,7 +166,8 @@ def march_sensitivities_of_many(
     turned = _Turned(modes, turns)
     inward, outward = (np.ascontiguousarray(matrix.T) for matrix in (modes.inward, modes.outward))
     at_s, keep, whole, late = np.nan, np.empty(n), np.empty(n), np.empty(n)
-    divided, identity, at = np.empty((3, n, n)), np.eye(n), entry_column * n + entry_node
+    divided, mixed, identity = np.empty((3, n, n)), np.empty((n, n)), np.eye(n)
+    at = entry_column * n + entry_node
     least = FADED * float(np.abs(start[:, moved:]).max(initial=0.0))
     for k in range(n_steps):
         if step_s[k] != at_s:
@@ -170,8 +182,7 @@ def march_sensitivities_of_many(
         first, last = (np.bincount(at, weights=entry_series[:, k, end], minlength=moved * n) for end in (0, 1))
         given = first.reshape(moved, n) @ inward * early + last.reshape(moved, n) @ inward * late
         if turns.columns.size > 0:
-            mixed = divided[0] * mode[k, 0] + divided[1] * pushed[k, 0] + divided[2] * pushed[k, 1]
-            mixed -= early[:, None] * mode[k, 0] + late[:, None] * mode[k, 1]
+            _mix(divided, early, late, mode[k], pushed[k], mixed)
             turned.add(mixed, inward, given)
         forward = turned_keep.T @ state + turned_early.T @ _changed(row, column, entry[k, 0], state)
         forward[:, :moved] += (given @ outward).T
