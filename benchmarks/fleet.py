@@ -22,7 +22,7 @@ import numpy as np
 import psycopg
 
 from benchmarks.markdown import markdown_table, save_table
-from service.store import jobs, ownership, samples, twins
+from service.store import appending, jobs, ownership, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -33,6 +33,8 @@ from tests.service.server import FAKE
 CHANNELS = 12
 ROWS = 200
 LANES = 4
+BEGIN_US = 1_767_225_600_000_000
+"""Of the telemetry: 2026-01-01."""
 
 
 def specification(name: str) -> dict[str, Any]:
@@ -51,7 +53,7 @@ def batches(count: int, n_twins: int, rows: int = ROWS) -> list[tuple[int, Batch
     made = []
     for number in range(count):
         first = number // n_twins * rows
-        time_us = (first + np.arange(rows, dtype=np.int64)) * 1_000_000
+        time_us = BEGIN_US + (first + np.arange(rows, dtype=np.int64)) * 1_000_000
         made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, rows)), time_us)))
     return made
 
@@ -62,18 +64,27 @@ def through_the_store(url: str, work: Sequence[tuple[int, Batch]], n_twins: int)
     for k in range(n_twins):
         database.submit(twins.register, f"s{k}", specification(f"s{k}"))
     database.submit(lambda c: None).result()
-    done = threading.Semaphore(0)
+    done, left, errors = threading.Event(), len(work), list[BaseException]()
+
+    def acknowledge(result: appending.Receipt, error: BaseException | None) -> None:
+        """Hear of one batch, in the thread that writes."""
+        nonlocal left
+        left -= 1
+        errors.extend([error] if error is not None else [])
+        if not left:
+            done.set()
+
     begun = time.perf_counter()
     for twin, batch in work:
-        database.submit_to(twin, lambda result, error: done.release(), samples.append, twin, batch)
-    for _ in work:
-        done.acquire()
+        database.submit_to(twin, acknowledge, appending.append, twin, batch)
+    done.wait()
+    assert not errors
     elapsed_s = time.perf_counter() - begun
     database.close()
     return sum(batch.time_us.size for _, batch in work) / elapsed_s
 
 
-def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int, table: str = "chunk") -> float:
+def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int) -> float:
     """Return samples per second of COPY into a stage and one INSERT ... SELECT, as many batches a commit as the store.
 
     It is less than the store does: heads do not move, numbers are not handed out, and only a whole batch is known again.
@@ -82,6 +93,7 @@ def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int,
     for k in range(n_twins):
         database.submit(twins.register, f"r{k}", specification(f"r{k}")).result()
     keys = database.engine.read(lambda c: [row[0] for row in c.execute("SELECT id FROM twin ORDER BY id").fetchall()])
+    database.submit(segments.make_room, [int(batch.time_us[0]) for _, batch in work]).result()
     database.close()
     with psycopg.connect(url, autocommit=True) as connection:
         connection.execute(
@@ -101,9 +113,9 @@ def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int,
                         row = (keys[twin - 1], n, *ends, n, seq, time_us, batch.values.tobytes(), time_us)
                         copy.write_row(row)
                 connection.execute(
-                    f"""INSERT INTO {table} (twin, n, first_us, last_us, last_seq, seq, time, value, received)
-                        SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM {table} AS held WHERE held.twin = stage.twin
-                        AND held.first_us = stage.first_us AND held.last_us = stage.last_us)"""  # type: ignore[arg-type]
+                    """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
+                        SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM chunk AS held WHERE held.twin = stage.twin
+                        AND held.first_us = stage.first_us AND held.last_us = stage.last_us)"""
                 )
         return sum(batch.time_us.size for _, batch in work) / (time.perf_counter() - begun)
 
@@ -114,6 +126,7 @@ def claims(url: str, count: int) -> tuple[float, float]:
     twin = database.submit(twins.register, "queue", specification("queue")).result()[0].key
 
     def fill(connection: Connection) -> None:
+        """Queue as many calibrations as asked for."""
         for k in range(count):
             connection.execute(
                 "INSERT INTO job (id, twin, kind, state, request, created_us) VALUES (?, ?, 'calibration', 'queued', '{}', 0)",
@@ -221,6 +234,7 @@ def look_ms(url: str, count: int) -> float:
     database = Database(url)
 
     def fill(connection: Connection) -> None:
+        """Store twins with an active model each, whose rows are as empty as the look allows."""
         connection.execute(
             """INSERT INTO twin (name, specification, created_us)
                SELECT 's' || k, '{}', 0 FROM generate_series(1, CAST(? AS BIGINT)) AS k""",

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from service.archive.intake import take_in
 from service.instants import now_us
 from service.store import aside, events
+from service.store.appending import Receipt
 from service.store.aside import Deletion
 from service.store.connection import Connection
-from service.store.samples import Receipt
 from service.stream.messages import EventStretch, Stretch
 from service.twins.registry import Entry
 

@@ -17,12 +17,12 @@ from service.instants import now_us
 from service.live.live import Live
 from service.monitoring import tracing
 from service.monitoring.metrics import Metrics
-from service.store import samples
+from service.store import segments
 from service.store.admission import admit
+from service.store.appending import Receipt
 from service.store.batch import MOST_VALUES, Batch
 from service.store.connection import Connection
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
-from service.store.samples import Receipt
 from service.stream.hub import Hub, settle
 from service.stream.messages import SampleStretch
 from service.twins.registry import Entry
@@ -109,7 +109,7 @@ def _joined(batches: list[Batch]) -> Batch:
     """Return batches as one, in their order."""
     if len(batches) == 1:
         return batches[0]
-    return samples.joined(batches, max(batch.values.shape[0] for batch in batches))
+    return segments.joined(batches, max(batch.values.shape[0] for batch in batches))
 
 
 def take_in(

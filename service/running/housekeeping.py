@@ -50,6 +50,9 @@ class Housekeeping:
             for what, chore in (*CHORES, *self._database.engine.chores) if leads else ():
                 await self._finish(what, partial(self._database.write, chore))
             if leads:
+                await self._finish(
+                    "what nobody keeps any more", partial(asyncio.to_thread, self._database.engine.drop_old)
+                )
                 await self._sweep()
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(EVERY_S if leads else SUCCESSION_S):

@@ -13,11 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from service.store import aside, rewrite, samples
+from service.store import appending, aside, rewrite, samples
+from service.store.appending import Receipt
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.merge import QUARANTINED
-from service.store.samples import Receipt
+from service.store.quarters import EVER_US
+from service.store.segments import WITHIN, within
 
 FAR = 10.0
 """In usual distances: a sample that lies further ahead of the others does not follow them."""
@@ -36,10 +38,10 @@ def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) ->
         By how much a clock may be fast; 0: whatever comes is stored.
     """
     if tolerance_us == 0 or not batch.time_us.size:
-        return samples.append(connection, twin, batch)
+        return appending.append(connection, twin, batch)
     limit_us = int(batch.received.max()) + tolerance_us
     if int(batch.time_us.max()) <= limit_us:
-        receipt = samples.append(connection, twin, batch)
+        receipt = appending.append(connection, twin, batch)
     else:
         receipt = _admit_some(connection, twin, batch, limit_us)
     if receipt.last_us is not None and receipt.last_us > limit_us and bool((batch.time_us <= limit_us).any()):
@@ -58,8 +60,8 @@ def _admit_some(connection: Connection, twin: int, batch: Batch, limit_us: int) 
         span = (int(batch.time_us[ahead].min()), int(batch.time_us[ahead].max()) + 1)
         ahead &= ~np.isin(batch.time_us, samples.arrived(connection, twin, -1, *span))
     if not ahead.any():
-        return samples.append(connection, twin, batch)
-    receipt = samples.append(connection, twin, batch.take(~ahead))
+        return appending.append(connection, twin, batch)
+    receipt = appending.append(connection, twin, batch.take(~ahead))
     aside.quarantine(connection, twin, batch.take(ahead))
     status = np.full(batch.time_us.size, QUARANTINED, dtype=np.int8)
     status[~ahead] = receipt.status
@@ -91,9 +93,9 @@ def _is_live(connection: Connection, twin: int, recent_us: NDArray[np.int64], li
     if not recent_us.size:
         return False
     tolerance_us = limit_us - int(batch.received.max())
-    query = """SELECT time, received FROM chunk WHERE twin = ? AND last_us >= ? AND received IS NOT NULL"""
+    query = f"SELECT time, received FROM chunk WHERE {WITHIN} AND received IS NOT NULL"
     delays = [np.empty(0)]
-    for time, received in connection.execute(query, (twin, int(recent_us[0]))):
+    for time, received in connection.execute(query, within(twin, int(recent_us[0]), EVER_US)):
         time_us = np.frombuffer(time, dtype="<i8")
         delays.append((np.frombuffer(received, dtype="<i8") - time_us)[time_us >= recent_us[0]].astype(np.float64))
     delay_us = np.concatenate(delays)
@@ -104,7 +106,7 @@ def _recover(connection: Connection, twin: int, batch: Batch, limit_us: int, tol
     """Move what the archive holds ahead of the present into quarantine, if it was no clock of its own; return how many."""
     past = batch.time_us <= limit_us
     live = bool((np.abs(batch.received - batch.time_us)[past] <= tolerance_us).any())
-    ahead = np.unique(samples.arrived(connection, twin, -1, limit_us + 1, 2**62))
+    ahead = np.unique(samples.arrived(connection, twin, -1, limit_us + 1, EVER_US))
     (n_samples,) = connection.execute("SELECT samples FROM head WHERE twin = ?", (twin,)).fetchone()
     if not ahead.size or not (live or n_samples - ahead.size > ahead.size):
         return 0
@@ -118,6 +120,6 @@ def _recover(connection: Connection, twin: int, batch: Batch, limit_us: int, tol
     if usual.size and ahead[0] - before[-1] <= FAR * np.median(usual):
         return 0  # one recording that runs on
     n_channels = batch.values.shape[0]
-    taken = rewrite.take_out(connection, twin, n_channels, limit_us + 1, 2**62, None)
+    taken = rewrite.take_out(connection, twin, n_channels, limit_us + 1, EVER_US, None)
     aside.quarantine(connection, twin, taken)
     return int(ahead.size)

@@ -11,7 +11,7 @@ import numpy as np
 import orjson
 
 from service.instants import format_instant, now_us
-from service.store import rewrite, samples
+from service.store import rewrite, segments
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.errors import Conflicting, Missing
@@ -75,7 +75,7 @@ def quarantine(connection: Connection, twin: int, batch: Batch) -> None:
     query = """SELECT time, value, received FROM aside WHERE twin = ? AND deletion IS NULL
                AND last_us >= ? AND first_us <= ?"""
     rows = connection.execute(query, (twin, *span)).fetchall()
-    held = samples.joined([samples.unpack(n_channels, *row) for row in rows], n_channels)
+    held = segments.joined([segments.unpack(n_channels, *row) for row in rows], n_channels)
     known = collapse(held.time_us, held.values) if held.time_us.size else (held.time_us, held.values)
     new = merge(*known, batch.time_us, batch.values).status == ACCEPTED
     if new.any():
@@ -110,11 +110,11 @@ def select(connection: Connection, twin: int, n_channels: int, most: int) -> Bat
     query = "SELECT n, time, value, received FROM aside WHERE twin = ? AND deletion IS NULL ORDER BY id"
     found: list[Batch] = []
     for n, *blobs in connection.execute(query, (twin,)):
-        found.append(samples.unpack(n_channels, *blobs))
+        found.append(segments.unpack(n_channels, *blobs))
         most -= n
         if most <= 0:
             break
-    whole = samples.joined(found, n_channels)
+    whole = segments.joined(found, n_channels)
     return whole.take(np.arange(whole.time_us.size) < whole.time_us.size + min(most, 0))
 
 
@@ -158,13 +158,13 @@ def _leave_quarantine(
                AND last_us >= ? AND first_us < ? ORDER BY id"""
     found = []
     for number, *blobs in connection.execute(query, (twin, start, stop)).fetchall():
-        held = samples.unpack(n_channels, *blobs)
+        held = segments.unpack(n_channels, *blobs)
         inside = (held.time_us >= start) & (held.time_us < stop)
         found.append(held.take(inside))
         connection.execute("DELETE FROM aside WHERE id = ?", (number,))
         if not inside.all():
             _put(connection, twin, None, held.take(~inside))
-    return samples.joined(found, n_channels)
+    return segments.joined(found, n_channels)
 
 
 def undo(connection: Connection, twin: int, n_channels: int, number: int) -> tuple[Deletion, Batch]:
@@ -182,13 +182,13 @@ def undo(connection: Connection, twin: int, n_channels: int, number: int) -> tup
         raise Conflicting(f"deletion {number} was undone already")
     if made.until_us < now_us():
         raise Conflicting(f"deletion {number} is more than a day old: what it deleted is gone")
-    back = samples.joined([], n_channels)
+    back = segments.joined([], n_channels)
     if made.place == "quarantine":
         connection.execute("UPDATE aside SET deletion = NULL WHERE deletion = ?", (number,))
     else:
         query = "SELECT time, value, received FROM aside WHERE deletion = ? ORDER BY id"
         rows = connection.execute(query, (number,)).fetchall()
-        back = samples.joined([samples.unpack(n_channels, *row) for row in rows], n_channels)
+        back = segments.joined([segments.unpack(n_channels, *row) for row in rows], n_channels)
         connection.execute("DELETE FROM aside WHERE deletion = ?", (number,))
     connection.execute("UPDATE deletion SET undone_us = ? WHERE id = ?", (now_us(), number))
     return next(row for row in deletions(connection, twin) if row.id == number), back

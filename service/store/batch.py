@@ -34,6 +34,7 @@ class Batch:
         """When each sample arrived, (n_times,); 0 where nobody noted it."""
         return np.zeros_like(self.time_us) if self.received_us is None else self.received_us
 
-    def take(self, keep: NDArray[np.bool_]) -> "Batch":
-        """Return the samples that a mask selects."""
-        return Batch(self.time_us[keep], self.values[:, keep], self.received[keep])
+    def take(self, keep: NDArray[np.bool_] | slice) -> "Batch":
+        """Return the samples that a mask, or a slice, selects."""
+        received_us = None if self.received_us is None else self.received_us[keep]
+        return Batch(self.time_us[keep], self.values[:, keep], received_us)

@@ -54,5 +54,11 @@ class Stage(Protocol):
     def head(self, twin: int) -> Head | None:
         """Return where a twin stands, whose archive this transaction has locked; None where that is not known."""
 
+    def make_room(self, instants: Iterable[int]) -> None:
+        """Let there be a place for segments that begin at some instants."""
+
     def put(self, segment: Row) -> None:
         """Store a segment that lies behind all of its twin, moving the twin's head: at the latest with the commit."""
+
+    def compact_later(self, twin: int, n_rows: int) -> None:
+        """Let the small segments of a twin, of so many rows, be compacted with the commit."""

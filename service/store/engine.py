@@ -61,5 +61,8 @@ class Engine(Protocol):
     def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
         """Go on counting behind what was copied: table -> the column whose numbers the database hands out."""
 
+    def drop_old(self) -> int:
+        """Remove at once a part of the archive of which no twin keeps anything; return how many segments went, 0: none."""
+
     def close(self) -> None:
         """Let go of everything."""

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import orjson
 
-from service.store import models
+from service.store import models, segments
 from service.store.connection import Connection
 from service.store.errors import Conflicting, Missing
 
@@ -68,6 +68,7 @@ def sweep_gone(connection: Connection) -> int:
         if removed:
             return removed
     connection.execute("DELETE FROM twin WHERE id = ?", row)
+    connection.execute("DELETE FROM chunk WHERE twin = ?", row)  # what came while its head was waited for
     return 1
 
 
@@ -106,14 +107,14 @@ def _old_samples(connection: Connection, twin: int, kept: Retention, last_us: in
     if kept.samples_days is None:
         return 0
     before_us = last_us - round(kept.samples_days * _US_PER_DAY)
-    query = "SELECT id, n FROM chunk WHERE twin = ? AND last_us < ? ORDER BY last_us LIMIT ?"
+    query = "SELECT id, first_us, n FROM chunk WHERE twin = ? AND last_us < ? ORDER BY last_us LIMIT ?"
     rows = connection.execute(query, (twin, before_us, ROWS)).fetchall()
     if rows:
-        connection.executemany("DELETE FROM chunk WHERE id = ?", [(chunk,) for chunk, _ in rows])
+        segments.remove(connection, [row[:2] for row in rows])
         connection.execute(
             """UPDATE head SET samples = CASE WHEN samples > ? THEN samples - ? ELSE 0 END,
                first_us = (SELECT min(first_us) FROM chunk WHERE chunk.twin = head.twin) WHERE twin = ?""",
-            (sum(n for _, n in rows), sum(n for _, n in rows), twin),
+            (*[sum(row[2] for row in rows)] * 2, twin),
         )
     return len(rows)
 

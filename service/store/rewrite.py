@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.store import residuals, samples
+from service.store import residuals, segments
 from service.store.batch import Batch
 from service.store.connection import Connection
+from service.store.segments import WITHIN, within
 
 
 def take_out(
@@ -23,11 +24,10 @@ def take_out(
     rows
         Positions of the channels that lose their values, while the samples stay; None: whole samples go.
     """
-    query = """SELECT id, seq, time, value, received FROM chunk WHERE twin = ? AND last_us >= ? AND first_us < ?
-               ORDER BY first_us, id"""
+    query = f"SELECT id, first_us, seq, time, value, received FROM chunk WHERE {WITHIN} ORDER BY first_us, id"
     taken = []
-    for chunk, seq_blob, *blobs in connection.execute(query, (twin, start_us, stop_us)).fetchall():
-        seq, held = np.frombuffer(seq_blob, dtype="<i8"), samples.unpack(n_channels, *blobs)
+    for chunk, first_us, seq_blob, *blobs in connection.execute(query, within(twin, start_us, stop_us)).fetchall():
+        seq, held = np.frombuffer(seq_blob, dtype="<i8"), segments.unpack(n_channels, *blobs)
         inside = (held.time_us >= start_us) & (held.time_us < stop_us)
         if rows is None:
             taken.append(held.take(inside))
@@ -41,10 +41,10 @@ def take_out(
             taken.append(Batch(held.time_us[some], values[:, some], held.received[some]))
             left = Batch(held.time_us, np.where(np.isfinite(values), np.nan, held.values), held.received_us)
             kept = seq
-        connection.execute("DELETE FROM chunk WHERE id = ?", (chunk,))
+        segments.remove(connection, [(chunk, first_us)])
         if kept.size:
-            samples.insert(connection, twin, kept, left)
-    found = samples.joined(taken, n_channels)
+            segments.insert(connection, twin, kept, left)
+    found = segments.joined(taken, n_channels)
     if found.time_us.size:
         _move_head(connection, twin, int(np.unique(found.time_us).size) if rows is None else 0)
         _forget(connection, twin, start_us, stop_us)
@@ -59,7 +59,7 @@ def _move_head(connection: Connection, twin: int, n_instants: int) -> None:
            WHERE twin = ?""",
         (n_instants, twin),
     )
-    samples.count_small(connection, twin)
+    segments.count_small(connection, twin)
 
 
 def _forget(connection: Connection, twin: int, start_us: int, stop_us: int) -> None:

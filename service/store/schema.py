@@ -4,7 +4,12 @@ Each step is a name, under which a database notes that it has gone through it, a
 databases have gone through it. The engines apply the steps, each in its own words.
 """
 
-TWINS_AND_SAMPLES = """
+SEGMENT = """n INTEGER NOT NULL, first_us INTEGER NOT NULL, last_us INTEGER NOT NULL, last_seq INTEGER NOT NULL,
+        seq BLOB NOT NULL, time BLOB NOT NULL, value BLOB NOT NULL"""
+OUTLINE = "instants INTEGER NOT NULL, time BLOB NOT NULL, value BLOB NOT NULL"
+"""Columns that samples and residuals have in common."""
+
+TWINS_AND_SAMPLES = f"""
     CREATE TABLE twin (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         name TEXT NOT NULL UNIQUE,
@@ -23,13 +28,7 @@ TWINS_AND_SAMPLES = """
     CREATE TABLE chunk (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
-        n INTEGER NOT NULL,
-        first_us INTEGER NOT NULL,
-        last_us INTEGER NOT NULL,
-        last_seq INTEGER NOT NULL,
-        seq BLOB NOT NULL,
-        time BLOB NOT NULL,
-        value BLOB NOT NULL
+        {SEGMENT}
     );
     CREATE INDEX chunk_span ON chunk (twin, last_us, first_us, n);
     CREATE INDEX chunk_seq ON chunk (twin, last_seq);
@@ -80,18 +79,12 @@ MODELS_AND_JOBS = """
     ) WITHOUT ROWID;
 """
 
-RESIDUALS_AND_ANOMALIES = """
+RESIDUALS_AND_ANOMALIES = f"""
     CREATE TABLE residual (
         id INTEGER PRIMARY KEY AUTOINCREMENT,
         twin INTEGER NOT NULL REFERENCES twin(id) ON DELETE CASCADE,
         version INTEGER NOT NULL,
-        n INTEGER NOT NULL,
-        first_us INTEGER NOT NULL,
-        last_us INTEGER NOT NULL,
-        last_seq INTEGER NOT NULL,
-        seq BLOB NOT NULL,
-        time BLOB NOT NULL,
-        value BLOB NOT NULL
+        {SEGMENT}
     );
     CREATE INDEX residual_span ON residual (twin, last_us, first_us, n);
     CREATE INDEX residual_seq ON residual (twin, last_seq);
@@ -117,18 +110,14 @@ RESIDUALS_AND_ANOMALIES = """
     CREATE INDEX anomaly_twin ON anomaly (twin, start_us);
 """
 
-OUTLINES = """
+OUTLINES = f"""
     CREATE TABLE chunk_outline (
         chunk INTEGER PRIMARY KEY REFERENCES chunk(id) ON DELETE CASCADE,
-        instants INTEGER NOT NULL,
-        time BLOB NOT NULL,
-        value BLOB NOT NULL
+        {OUTLINE}
     );
     CREATE TABLE residual_outline (
         chunk INTEGER PRIMARY KEY REFERENCES residual(id) ON DELETE CASCADE,
-        instants INTEGER NOT NULL,
-        time BLOB NOT NULL,
-        value BLOB NOT NULL
+        {OUTLINE}
     );
 """
 """Add outlines of large chunks; chunks that were stored before have none and are read whole."""
@@ -271,6 +260,12 @@ RETURNED = """
 """
 """Add how often a job was given back untried: numbers of attempts only grow, since they fence."""
 
+QUARTERS = """
+    ALTER TABLE head ADD COLUMN reach_us INTEGER NOT NULL DEFAULT 0;
+    UPDATE head SET reach_us = (SELECT coalesce(max(last_us - first_us), 0) FROM chunk WHERE chunk.twin = head.twin);
+"""
+"""Add how long any segment of earlier releases is: since then none holds samples of two quarters."""
+
 STEPS: tuple[tuple[str, str], ...] = (
     ("twins and samples", TWINS_AND_SAMPLES),
     ("models and jobs", MODELS_AND_JOBS),
@@ -282,6 +277,7 @@ STEPS: tuple[tuple[str, str], ...] = (
     ("workers", WORKERS),
     ("vitals", VITALS),
     ("returned jobs", RETURNED),
+    ("quarters", QUARTERS),
 )
 
 

@@ -11,6 +11,7 @@ from service.instants import format_instant
 from service.store import samples
 from service.store.connection import Connection
 from service.store.samples import Samples
+from service.store.segments import WITHIN, within
 
 _EVER = 2**62
 How = Literal["all", "newest", "thinned"]
@@ -89,9 +90,8 @@ def _count(connection: Connection, twin: int, start: int, stop: int) -> int:
     """Return how many samples lie in start <= time < stop; those that came in pieces count as often."""
     inside = "SELECT coalesce(sum(n), 0) FROM chunk WHERE twin = ? AND first_us >= ? AND last_us < ?"
     count = int(connection.execute(inside, (twin, start, stop)).fetchone()[0])
-    edges = """SELECT time FROM chunk WHERE twin = ? AND last_us >= ? AND first_us < ?
-               AND NOT (first_us >= ? AND last_us < ?)"""
-    for (time,) in connection.execute(edges, (twin, start, stop, start, stop)):
+    edges = f"SELECT time FROM chunk WHERE {WITHIN} AND NOT (first_us >= ? AND last_us < ?)"
+    for (time,) in connection.execute(edges, (*within(twin, start, stop), start, stop)):
         time_us = np.frombuffer(time, dtype="<i8")
         count += int(((time_us >= start) & (time_us < stop)).sum())
     return count
@@ -100,9 +100,9 @@ def _count(connection: Connection, twin: int, start: int, stop: int) -> int:
 def _newest(connection: Connection, twin: int, n_channels: int, start: int, stop: int, most: int) -> Samples:
     """Return the last ``most`` samples of start <= time < stop, reading little more than they are."""
     length, first = 2 * most, start
-    query = "SELECT first_us, n FROM chunk WHERE twin = ? AND first_us < ? AND last_us >= ? ORDER BY last_us DESC"
+    query = f"SELECT first_us, n FROM chunk WHERE {WITHIN} ORDER BY last_us DESC"
     held = 0
-    for first_us, n in connection.execute(query, (twin, stop, start)):
+    for first_us, n in connection.execute(query, within(twin, start, stop)):
         held, first = held + n, first_us if held == 0 else min(first, first_us)
         if held >= length:  # chunks may overlap: one that began earlier may end later
             break

@@ -11,12 +11,13 @@ from service.store.connection import Connection
 from service.store.database import open_engine
 from service.store.engine import Engine
 from service.store.errors import StoreError
+from service.store.segments import make_room
 
 TABLES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "twin": (("id",), ("id", "name", "specification", "created_us", "gone_us", "revision", "retention")),
     "head": (
         ("twin",),
-        ("twin", "seq", "samples", "first_us", "last_us", "small_chunks", "small_rows", "revision"),
+        ("twin", "seq", "samples", "first_us", "last_us", "small_chunks", "small_rows", "revision", "reach_us"),
     ),
     "chunk": (("id",), ("id", "twin", "n", "first_us", "last_us", "last_seq", "seq", "time", "value", "received")),
     "chunk_outline": (("chunk",), ("chunk", "instants", "time", "value")),
@@ -111,6 +112,8 @@ def _copy(origin: Connection, goal: Engine) -> list[Moved]:
         for table in TABLES:
             read = _Digest()
             for page in read.pages(origin, table):
+                if table == "chunk":
+                    make_room(session.connection, [row[3] for row in page])
                 _insert(session.connection, table, page)
             written = _Digest()
             for _ in written.pages(session.connection, table):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.instants import format_instant, now_us
-from service.store import alarms, anomalies, fleet, models, samples, twins
+from service.store import alarms, anomalies, appending, fleet, models, twins
 from service.store.alarms import Limit
 from service.store.anomalies import Change
 from service.store.batch import Batch
@@ -35,7 +35,7 @@ def fill(connection: Connection, at_us: int) -> None:
         twin, _ = twins.register(connection, f"sat-{k:04}", {**SPEC, "twin": f"sat-{k:04}", "family": family})
         ages_us = 30_000_000 * np.arange(40, 0, -1) + (3_600_000_000 if k % 100 == 7 else 0)
         time_us = (at_us - ages_us).astype(np.int64)
-        samples.append(connection, twin.key, Batch(time_us, generator.normal(290, 1, (3, 40)), time_us + 1_000_000))
+        appending.append(connection, twin.key, Batch(time_us, generator.normal(290, 1, (3, 40)), time_us + 1_000_000))
         if k % 200 == 11:
             continue
         summary = {"epoch_us": at_us, "train": {}, "validation": {"rmse_K": 0.1}, "effects": []}

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from service.jobs.executor import JobFailed, ProcessPerTask, Task
-from service.store import retention, samples, selection
+from service.store import appending, retention, selection
 from service.store.batch import Batch
 from service.store.database import Database
 from service.workbench.core import CoreWorkbench
@@ -59,7 +59,9 @@ def test_a_thinned_archive_keeps_readings_and_loses_no_heat(database: Database) 
     values[1, generator.random(4000) < 0.3] = np.nan  # an input that is sent when it changes
     values[1, 0] = 20.0
     for first in range(0, 4000, 500):
-        database.submit(samples.append, 1, Batch(time_us[first : first + 500], values[:, first : first + 500])).result()
+        database.submit(
+            appending.append, 1, Batch(time_us[first : first + 500], values[:, first : first + 500])
+        ).result()
     made = database.submit(selection.choose, 1, 2, None, None, 400, True, [0], [1]).result()
     kept = made.samples
     assert (made.how, made.stride, made.of, kept.time_us.size) == ("thinned", 10, 4000, 400)
@@ -75,7 +77,7 @@ def test_sensors_that_report_in_turn_all_stay_in_a_thinned_archive(database: Dat
     values = np.full((4, 4000), np.nan)
     for row in range(4):
         values[row, row::4] = row
-    database.submit(samples.append, 1, Batch(np.arange(4000) * 1_000_000, values)).result()
+    database.submit(appending.append, 1, Batch(np.arange(4000) * 1_000_000, values)).result()
     kept = database.submit(selection.choose, 1, 4, None, None, 1000, True, [0, 1, 2, 3], []).result().samples
     assert (np.isfinite(kept.values).sum(axis=1) >= 200).all()
 
@@ -121,7 +123,7 @@ def test_a_diagnosis_that_had_no_time_answers_and_says_so(
 def test_a_window_knows_the_inputs_that_hold_where_it_begins(database: Database) -> None:
     values = np.stack([np.full(100, 290.0), np.full(100, np.nan)])
     values[1, 3] = 7.0
-    database.submit(samples.append, 1, Batch(np.arange(100) * 1_000_000, values)).result()
+    database.submit(appending.append, 1, Batch(np.arange(100) * 1_000_000, values)).result()
     kept = database.submit(selection.choose, 1, 2, None, None, 50, False, [0], []).result().samples
     assert kept.time_us[0] == 50_000_000 and kept.values[1, 0] == 7.0 and np.isnan(kept.values[1, 1:]).all()
 

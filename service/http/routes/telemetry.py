@@ -20,8 +20,9 @@ from service.instants import format_instant, format_instants, parse_instant, par
 from service.keys import Role
 from service.schemas import Archive, Deletion, DeletionList, IngestReport, Interval, Posted, Quarantine
 from service.store import aside, samples
+from service.store.appending import Receipt
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
-from service.store.samples import Receipt, Samples
+from service.store.samples import Samples
 from service.twins.registry import Entry
 
 PREFIX = "/v1/twins/{twin}/telemetry"

@@ -4,14 +4,17 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any, TypeVar
 
 import psycopg
 from psycopg import errors
 
+from service.store import segments
 from service.store.connection import Connection, Cursor
 from service.store.errors import DiskFull, StoreError, Unavailable
+from service.store.postgres import partitions
 from service.store.postgres.migrations import migrate
 from service.store.postgres.stage import Stage
 
@@ -104,9 +107,10 @@ class PostgresSession:
         """Begin a transaction and lock the heads of these twins."""
         if not self.in_transaction:
             self._connect()
-        self._speaking.execute("BEGIN")
-        if twins:
-            self._stage.begin(twins)
+        with self._speaking.driver.pipeline() if twins else nullcontext():
+            self._speaking.driver.execute("BEGIN")
+            if twins:
+                self._stage.begin(twins)
 
     def turn(self, twin: int | None) -> None:
         """Hear whose twin's the next statements are; None: they may concern any."""
@@ -114,13 +118,16 @@ class PostgresSession:
 
     def commit(self) -> None:
         """Make it durable."""
-        self._stage.flush()
-        self._speaking.driver.execute("COMMIT")
+        if self._stage.due:
+            self._stage.turn(None)
+            segments.compact(self._speaking, self._stage.due)
+        self._stage.flush("COMMIT")
         self._stage.end()
 
     def roll_back(self) -> None:
         """Undo it; a connection that cannot even do that is given up."""
         self._stage.end()
+        self._stage.rooms.clear()
         try:
             self._speaking.driver.execute("ROLLBACK")
         except psycopg.Error:
@@ -139,7 +146,11 @@ class PostgresSession:
 
     def _speak(self) -> None:
         self._speaking = Speaking(connect(self._url))
-        self._stage = self._speaking.stage = Stage(self._speaking.driver)
+        self._stage = self._speaking.stage = Stage(self._speaking.driver, self._make_rooms)
+
+    def _make_rooms(self, instants: Iterable[int]) -> dict[str, tuple[int, int]]:
+        with connect(self._url) as driver:  # not in the transaction that is open: its locks would be waited for
+            return partitions.make(Speaking(driver), instants)
 
 
 class PostgresEngine:
@@ -198,8 +209,8 @@ class PostgresEngine:
                 speaking.driver.close()
 
     def is_passing(self, error: Exception) -> bool:
-        """Return whether transactions stood in each other's way."""
-        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure)
+        """Return whether transactions stood in each other's way, or a partition was dropped that a segment was to go into."""
+        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure | errors.CheckViolation)
 
     def refusal(self, error: Exception) -> Exception:
         """Return what the caller is told about a fault."""
@@ -218,6 +229,14 @@ class PostgresEngine:
                 f"SELECT setval(pg_get_serial_sequence('{table}', '{column}'), greatest(max({column}), 1)) FROM {table}"
             )
             connection.execute(query)
+
+    def drop_old(self) -> int:
+        """Drop a quarter of which no twin keeps anything, on a connection that holds no locks."""
+        try:
+            with connect(self.url) as driver:
+                return partitions.drop_one(Speaking(driver))
+        except psycopg.Error as error:
+            raise self.refusal(error) from None
 
     def close(self) -> None:
         """Close the readers' connections."""

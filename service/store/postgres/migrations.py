@@ -5,10 +5,12 @@ when SQLite files had lived through seven steps: they are its first one.
 """
 
 import re
+from collections.abc import Callable, Sequence
 
 from service.store import schema
 from service.store.connection import Connection
 from service.store.errors import StoreError
+from service.store.postgres import partitions
 
 LOCK = 0x7457_494E
 """Advisory lock that several processes which start at once take in turn."""
@@ -64,8 +66,11 @@ def _spoken(script: str) -> list[str]:
     return schema.statements(re.sub("|".join(WORDS), lambda found: WORDS[found[0]], script))
 
 
-def _steps() -> tuple[tuple[str, list[str]], ...]:
-    shared = {name: _spoken(script) for name, script in schema.STEPS}
+Step = str | Callable[[Connection], None]
+
+
+def _steps() -> tuple[tuple[str, Sequence[Step]], ...]:
+    shared: dict[str, Sequence[Step]] = {name: _spoken(script) for name, script in schema.STEPS}
     early = list(shared)[: list(shared).index("workers")]
     stored = [
         f"ALTER TABLE {table} ALTER COLUMN {column} SET STORAGE EXTERNAL"
@@ -76,7 +81,8 @@ def _steps() -> tuple[tuple[str, list[str]], ...]:
     first = ("base", [*base, *stored, OFTEN_WRITTEN.format("head")])
     second = ("fleet", [*shared.pop("workers"), *schema.statements(FLEET)])
     third = ("vitals", [*shared.pop("vitals"), OFTEN_WRITTEN.format("vital")])
-    return (first, second, third, *shared.items())
+    last = ("quarters", [*shared.pop("quarters"), partitions.divide])
+    return (first, second, third, *shared.items(), last)
 
 
 STEPS = _steps()
@@ -101,10 +107,13 @@ def migrate(connection: Connection) -> list[str]:
             f"TWIN_DATABASE_URL: the database was written by a newer version (step '{sorted(unknown)[0]}')"
         )
     applied = []
-    for name, statements in STEPS:
+    for name, steps in STEPS:
         if name not in done:
-            for statement in statements:
-                connection.execute(statement)
+            for step in steps:
+                if callable(step):
+                    step(connection)
+                else:
+                    connection.execute(step)
             connection.execute("INSERT INTO migration (name) VALUES (?)", (name,))
             applied.append(name)
     connection.execute("COMMIT")

@@ -1,6 +1,7 @@
 """Segments of many twins on their way into one table: COPY into a stage, then one INSERT … SELECT that moves the heads, too."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from itertools import chain
 from typing import Any
 
@@ -13,7 +14,7 @@ COLUMNS = {
     **dict.fromkeys(("twin", "n", "first_us", "last_us", "last_seq"), "int8"),
     **dict.fromkeys(("seq", "time", "value", "received"), "bytea"),
 }
-MAKE = f"""CREATE TEMPORARY TABLE IF NOT EXISTS stage ({", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())})
+MAKE = f"""CREATE TEMPORARY TABLE stage ({", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())})
            ON COMMIT DELETE ROWS"""
 STORE = """WITH staged ({names}) AS ({source}),
            taken AS (SELECT twin, sum(n) AS n, count(*) AS chunks, min(first_us) AS first_us, max(last_us) AS last_us
@@ -25,6 +26,8 @@ STORE = """WITH staged ({names}) AS ({source}),
                      RETURNING head.twin)
            INSERT INTO chunk ({names}) SELECT {names} FROM staged WHERE twin IN (SELECT twin FROM moved) ORDER BY last_seq"""
 """What a head has passed is in the archive and does not enter it again."""
+Rooms = dict[str, tuple[int, int]]
+"""Partitions and the instants, start <= first_us < stop, that they are for."""
 FEW = 4
 """So many segments go along with the statement itself: a stage costs more than it saves."""
 
@@ -32,9 +35,12 @@ FEW = 4
 class Stage:
     """What waits in the transaction of one connection."""
 
-    def __init__(self, driver: "psycopg.Connection[Any]") -> None:
-        """Hold nothing."""
-        self._driver = driver
+    def __init__(self, driver: "psycopg.Connection[Any]", make: Callable[[Iterable[int]], Rooms]) -> None:
+        """Hold nothing; ``make`` makes partitions for segments that begin at some instants, and tells which there are."""
+        self._driver, self._make = driver, make
+        driver.execute(MAKE)
+        self.rooms: Rooms = {}
+        self.due: dict[int, int] = {}
         self._heads: dict[int, Head] = {}
         self._rows: list[Row] = []
         self._turn: int | None = None
@@ -48,6 +54,7 @@ class Stage:
     def end(self) -> None:
         """Forget the transaction, whatever became of it."""
         self._heads, self._rows, self._turn, self._is_used = {}, [], None, False
+        self.due = {}
 
     def turn(self, twin: int | None) -> None:
         """Hear whose twin's the next statements are; None: they may concern any."""
@@ -57,9 +64,21 @@ class Stage:
         """Return where a twin stands, as long as only segments have been put behind it."""
         return self._heads.get(twin) if twin == self._turn else None
 
+    def make_room(self, instants: Iterable[int]) -> None:
+        """Make the partitions that segments need which begin at some instants, as far as they are not known to be there."""
+        missing = [t for t in instants if not any(first <= t < stop for first, stop in self.rooms.values())]
+        if missing:
+            self.rooms = self._make(missing)
+            name = next(name for name, (first, stop) in self.rooms.items() if first <= missing[0] < stop)
+            self._driver.execute(f"SELECT FROM {name} LIMIT 0")  # type: ignore[arg-type]  # a lock, with which news is heard
+
     def put(self, segment: Row) -> None:
         """Let a segment wait."""
         self._rows.append(segment)
+
+    def compact_later(self, twin: int, n_rows: int) -> None:
+        """Note that the small segments of a twin are to be compacted with the commit."""
+        self.due[twin] = n_rows
 
     def make_way(self) -> None:
         """Let other statements find what was put here of the twin whose turn it is, and move its head."""
@@ -70,21 +89,31 @@ class Stage:
         else:
             self._heads.pop(self._turn, None)
 
-    def flush(self) -> None:
-        """Store what waits."""
+    def flush(self, *after: str) -> None:
+        """Store what waits, and run statements that follow in the same round trip."""
         rows, self._rows = self._rows, []
-        if not rows:
-            return
-        names = ", ".join(COLUMNS)
-        if len(rows) <= FEW:
-            place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"
-            source = f"VALUES {', '.join([place] * len(rows))}"
-            self._driver.execute(STORE.format(names=names, source=source), list(chain(*rows)))
-            return
-        self._driver.execute("TRUNCATE stage" if self._is_used else MAKE)
+        parameters: list[Any] = []
+        if rows:
+            self.make_room(row[2] for row in rows)
+            names = ", ".join(COLUMNS)
+            source = f"SELECT {names} FROM stage"
+            if len(rows) <= FEW:
+                place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"
+                source, parameters = f"VALUES {', '.join([place] * len(rows))}", list(chain(*rows))
+            else:
+                self._copy(rows)
+            after = (STORE.format(names=names, source=source), *after)
+        with self._driver.pipeline() if len(after) > 1 else nullcontext():
+            for statement in after:
+                self._driver.execute(statement, parameters)  # type: ignore[arg-type]
+                parameters = []
+
+    def _copy(self, rows: Iterable[Row]) -> None:
+        """Let the stage hold segments, and nothing else."""
+        if self._is_used:
+            self._driver.execute("TRUNCATE stage")
         self._is_used = True
         with self._driver.cursor().copy("COPY stage FROM STDIN (FORMAT BINARY)") as copy:
             copy.set_types(list(COLUMNS.values()))
             for row in rows:
                 copy.write_row(row)
-        self._driver.execute(STORE.format(names=names, source=f"SELECT {names} FROM stage"))

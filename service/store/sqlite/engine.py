@@ -114,6 +114,10 @@ class SqliteEngine:
     def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
         """Do nothing: SQLite looks at the rows itself."""
 
+    def drop_old(self) -> int:
+        """Return 0: a file has no such parts."""
+        return 0
+
     def close(self) -> None:
         """Close the readers' connections and release the file."""
         for connection in self._opened:

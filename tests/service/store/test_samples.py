@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.store import events, residuals, samples, twins
+from service.store import appending, events, residuals, samples, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import open_engine
@@ -34,7 +34,7 @@ def test_many_batches_in_any_order(connection: Connection) -> None:
         part = order[position : position + int(generator.integers(1, 80))]
         position += part.size
         batch = Batch(part.astype(np.int64) * 1000, np.stack([part * 1.0, -part * 1.0]))
-        receipt = samples.append(connection, 1, batch)
+        receipt = appending.append(connection, 1, batch)
         assert receipt.stored.all()
         numbers += range(receipt.first_seq, receipt.first_seq + part.size)
     assert numbers == list(range(1, 4001))
@@ -44,34 +44,34 @@ def test_many_batches_in_any_order(connection: Connection) -> None:
     part = samples.select(connection, 1, 2, [0, 1], 5000, 9000)
     assert part.values[0].tolist() == [5, 6, 7, 8]
     chunks = connection.execute("SELECT count(*) FROM chunk").fetchone()[0]
-    assert chunks < samples.MOST_SMALL_CHUNKS + 40  # a chunk per batch would be about a hundred
+    assert chunks < segments.MOST_SMALL_CHUNKS + 40  # a chunk per batch would be about a hundred
     seqs, replayed = samples.since_seq(connection, 1, 2, 3990)
     assert seqs.tolist() == list(range(3991, 4001))
     assert replayed.time_us.tolist() == (order[-10:] * 1000).tolist()
-    again = samples.append(connection, 1, Batch(found.time_us, np.stack([found.values[0] * -1, found.values[0]])))
+    again = appending.append(connection, 1, Batch(found.time_us, np.stack([found.values[0] * -1, found.values[0]])))
     assert again.counts == [0, 4000, 0, 0]
 
 
 def test_compaction_does_not_span_idle_time(connection: Connection) -> None:
     year_us = 365 * 86_400 * 10**6
-    for number in range(samples.MOST_SMALL_CHUNKS):
+    for number in range(segments.MOST_SMALL_CHUNKS):
         instant = (number % 2) * year_us + number * 10**6
-        samples.append(connection, 1, Batch(np.array([instant]), np.zeros((2, 1))))
+        appending.append(connection, 1, Batch(np.array([instant]), np.zeros((2, 1))))
     spans = connection.execute("SELECT last_us - first_us FROM chunk").fetchall()
     assert len(spans) == 2 and max(spans)[0] < year_us // 1000
 
 
 def test_numbers_are_shared_with_events(connection: Connection) -> None:
     one = Batch(np.array([5]), np.zeros((2, 1)))
-    assert samples.append(connection, 1, one).first_seq == 1
+    assert appending.append(connection, 1, one).first_seq == 1
     assert [e.seq for e in events.append(connection, 1, 0, [("job", {}), ("model", {})])] == [2, 3]
-    assert samples.append(connection, 1, Batch(np.array([6]), np.zeros((2, 1)))).first_seq == 4
+    assert appending.append(connection, 1, Batch(np.array([6]), np.zeros((2, 1)))).first_seq == 4
 
 
 def test_blocks_cover_everything_once(connection: Connection) -> None:
     for start in range(0, 20_000, 1000):
         time_us = np.arange(start, start + 1000, dtype=np.int64)
-        samples.append(connection, 1, Batch(time_us, np.zeros((2, 1000))))
+        appending.append(connection, 1, Batch(time_us, np.zeros((2, 1000))))
     seen, position = 1, 0
     while True:
         stop = samples.block_stop(connection, 1, position, 5000)
@@ -94,9 +94,9 @@ def wave(first: int, count: int) -> Batch:
 
 def test_an_overview_holds_every_extreme(connection: Connection) -> None:
     for first in (0, 20_000, 40_000, 60_000):
-        samples.append(connection, 1, wave(first, 15_000))
+        appending.append(connection, 1, wave(first, 15_000))
     late = Batch(np.array([62_000_500, 62_001_500]), np.array([[99.0, -99.0], [np.nan, 0.0]]))
-    samples.append(connection, 1, late)
+    appending.append(connection, 1, late)
     for start, stop, rows in ((None, None, [0, 1]), (5_000_000, 72_000_000, [1]), (61_000_000, 64_000_000, [0])):
         whole = samples.select(connection, 1, 2, rows, start, stop)
         found, count = samples.overview(connection, 1, 2, rows, start, stop, 40)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from service.instants import now_us
-from service.store import events, samples, twins
+from service.store import appending, events, samples, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database, _settle
@@ -19,7 +19,10 @@ from service.store.postgres.stage import FEW, Stage
 
 TWINS, ROUNDS, ORDERS = 5, 60, 14
 SPEC = {"channels": {"a": {}, "b": {}}}
-HEAD = "SELECT seq, samples, first_us, last_us, small_chunks, small_rows FROM head WHERE twin = ?"
+HEAD = "SELECT seq, samples, first_us, last_us FROM head WHERE twin = ?"
+SMALL = """SELECT small_chunks, small_rows, (SELECT count(*) FROM chunk WHERE twin = head.twin AND n < 512),
+           (SELECT sum(n) FROM chunk WHERE twin = head.twin AND n < 512) FROM head WHERE twin = ?"""
+"""A server compacts with the commit, a file at once: each must have counted what it has."""
 Operation = tuple[int, Callable[..., Any], tuple[Any, ...]]
 
 
@@ -47,7 +50,7 @@ def together(database: Database, orders: Sequence[Operation]) -> list[Any]:
 
 
 def appended(connection: Connection, twin: int, batch: Batch) -> tuple[list[int], int, int | None]:
-    receipt = samples.append(connection, twin, batch)
+    receipt = appending.append(connection, twin, batch)
     return receipt.status.tolist(), receipt.first_seq, receipt.last_us
 
 
@@ -85,9 +88,9 @@ def test_a_server_stores_what_a_file_stores(stores: tuple[Database, Database], m
     sizes: list[int] = []
     flush = Stage.flush
 
-    def counted(stage: Stage) -> None:
+    def counted(stage: Stage, *after: str) -> None:
         sizes.append(len(stage._rows))
-        flush(stage)
+        flush(stage, *after)
 
     monkeypatch.setattr(Stage, "flush", counted)
     generator, newest = np.random.default_rng(0), [-1] * TWINS
@@ -106,6 +109,9 @@ def test_a_server_stores_what_a_file_stores(stores: tuple[Database, Database], m
             )
         )
         assert tuple(heads[0]) == tuple(heads[1])
+        for database in stores:
+            chunks, rows, *really = database.engine.read(lambda c, key=twin: c.execute(SMALL, (key,)).fetchone())
+            assert [chunks, rows] == really and chunks < segments.MOST_SMALL_CHUNKS
         np.testing.assert_array_equal(held[0].time_us, np.arange(newest[twin - 1] + 1) * 1000)
         np.testing.assert_array_equal(held[0].time_us, held[1].time_us)
         np.testing.assert_array_equal(held[0].values, held[1].values)
@@ -121,7 +127,7 @@ def test_what_a_head_has_passed_does_not_enter_again(postgres: str) -> None:
 
     def twice(connection: Any, twin: int) -> None:
         for _ in range(2):
-            connection.stage.put(samples._segment(twin, time_us + 1, batch))
+            connection.stage.put(segments.segment(twin, time_us + 1, batch))
             connection.stage.flush()
 
     together(database, [(1, twice, ())])

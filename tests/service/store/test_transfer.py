@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from service.store import events, models, samples, twins
+from service.store import appending, events, models, samples, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -22,7 +22,7 @@ def fill(connection: Connection) -> None:
     for first in range(0, 3000, 600):
         values = generator.normal(size=(2, 600))
         values[0, 7] = np.nan
-        samples.append(connection, 1, Batch(np.arange(first, first + 600) * 10**6, values, np.arange(600)))
+        appending.append(connection, 1, Batch(np.arange(first, first + 600) * 10**6, values, np.arange(600)))
     events.append(connection, 1, 5, [("job", {"text": "ä\n'quoted' ?%s"})])
     models.add(connection, 1, "manual", {"epoch_us": 0, "train": {}}, {"spec": SPEC})
     models.activate(connection, 1, 1, "requested")

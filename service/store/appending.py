@@ -1,0 +1,176 @@
+"""Appending batches to the archive: what comes after everything goes in as it is, anything else is merged first."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.store import segments
+from service.store.batch import Batch
+from service.store.blobs import matrix
+from service.store.connection import Connection, Head, Stage
+from service.store.errors import TwinGone
+from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
+from service.store.quarters import divided, quarter_of
+from service.store.segments import MOST_SMALL_CHUNKS, MOST_SMALL_ROWS, SMALL, WITHIN, within
+
+STAGED_BYTES = 1900
+"""What is larger does not fit a row of PostgreSQL and is written out of line, on its way through a stage twice."""
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """What became of a batch: (n_times,) status, the number of the first stored sample, the archive's last instant.
+
+    ``moved`` is how many samples that were stored before had to go into quarantine because of it.
+    """
+
+    status: NDArray[np.int8]
+    first_seq: int
+    last_us: int | None
+    moved: int = 0
+
+    @property
+    def stored(self) -> NDArray[np.bool_]:
+        """Which samples were stored."""
+        return self.status == ACCEPTED
+
+    @cached_property
+    def counts(self) -> list[int]:
+        """How many samples have each status."""
+        counts: list[int] = np.bincount(self.status, minlength=QUARANTINED + 1).tolist()
+        return counts
+
+    @property
+    def quarantined(self) -> list[int]:
+        """Where the samples stand that lie ahead of the present."""
+        quarantined: list[int] = np.flatnonzero(self.status == QUARANTINED).tolist()
+        return quarantined
+
+    @property
+    def conflicts(self) -> list[int]:
+        """Where the samples stand that contradict the archive."""
+        conflicts: list[int] = np.flatnonzero(self.status == CONFLICT).tolist()
+        return conflicts
+
+
+def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
+    """Store what is new in a batch."""
+    time_us = batch.time_us
+    n = time_us.size
+    if n == 1 or (n and bool((time_us[1:] > time_us[:-1]).all())):
+        stage: Stage | None = getattr(connection, "stage", None)
+        if stage is not None and 8 * (batch.values.size + 3 * n) < STAGED_BYTES:
+            known = stage.head(twin)
+            if known is not None and (known.last_us is None or known.last_us < time_us[0]):
+                return _put(stage, known, twin, batch)
+        head = _advance(connection, twin, batch, n, after_all=True)
+        if head is not None:
+            _write(connection, twin, batch, head)
+            return Receipt(np.zeros(n, dtype=np.int8), head[0] - n + 1, int(time_us[-1]))
+    return _merge_in(connection, twin, batch)
+
+
+def _put(stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
+    """Store a small batch that comes after everything that is stored, together with those of other twins."""
+    n, first_seq, first_us, last_us = batch.time_us.size, head.seq + 1, int(batch.time_us[0]), int(batch.time_us[-1])
+    head.seq, head.last_us, head.small_rows = head.seq + n, last_us, head.small_rows + n
+    seq = np.arange(first_seq, head.seq + 1)
+    if quarter_of(first_us) == quarter_of(last_us):
+        stage.put(segments.packed(twin, (first_us, last_us, head.seq), seq, batch))
+        head.small_chunks += 1
+    else:
+        for part in divided(batch.time_us):
+            stage.put(segments.segment(twin, seq[part], batch.take(part)))
+            head.small_chunks += 1
+    if head.small_chunks >= MOST_SMALL_CHUNKS or head.small_rows >= MOST_SMALL_ROWS:
+        stage.compact_later(twin, batch.values.shape[0])
+    return Receipt(np.zeros(n, dtype=np.int8), first_seq, last_us)
+
+
+def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
+    """Store what is new in a batch that is late, unordered or empty."""
+    row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
+    if row is None:
+        raise TwinGone(f"twin {twin} is gone")
+    if batch.time_us.size == 0:
+        return Receipt(np.empty(0, dtype=np.int8), row[0] + 1, row[1])
+    fate = merge(*_around(connection, twin, batch), batch.time_us, batch.values)
+    kept = fate.status == ACCEPTED
+    if not kept.any():
+        return Receipt(fate.status, row[0] + 1, row[1])
+    stored = batch.take(kept)
+    head = _advance(connection, twin, stored, fate.n_instants, after_all=False)
+    if head is None:
+        raise TwinGone(f"twin {twin} is gone")
+    _write(connection, twin, stored, head)
+    return Receipt(fate.status, row[0] + 1, max(int(stored.time_us.max()), row[1] or 0))
+
+
+def _advance(
+    connection: Connection, twin: int, batch: Batch, n_instants: int, *, after_all: bool
+) -> tuple[int, int, int] | None:
+    """Move the head of the archive and return its number, small chunks and small rows.
+
+    With ``after_all`` only if the whole batch comes after everything that is stored; None if not.
+    """
+    n = int(batch.time_us.size)
+    first_us, last_us = int(batch.time_us.min()), int(batch.time_us.max())
+    small = [size for part in divided(batch.time_us) if (size := batch.time_us[part].size) < SMALL]
+    row: tuple[int, int, int] | None = connection.execute(
+        """UPDATE head SET seq = seq + ?, samples = samples + ?,
+           first_us = CASE WHEN first_us < ? THEN first_us ELSE ? END,
+           last_us = CASE WHEN last_us > ? THEN last_us ELSE ? END,
+           small_chunks = small_chunks + ?, small_rows = small_rows + ?
+           WHERE twin = ? AND (last_us IS NULL OR last_us < ?) RETURNING seq, small_chunks, small_rows""",
+        (
+            *(n, n_instants, first_us, first_us, last_us, last_us, len(small), sum(small), twin),
+            first_us if after_all else 2**62,
+        ),
+    ).fetchone()
+    return row
+
+
+def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int, int]) -> None:
+    """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
+    seq, small_chunks, small_rows = head
+    n = int(batch.time_us.size)
+    segments.insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch)
+    if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
+        segments.compact(connection, {twin: batch.values.shape[0]})
+
+
+def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
+    instants, n_rows = np.unique(batch.time_us), batch.values.shape[0]
+    query = f"SELECT id, first_us, last_us FROM chunk WHERE {WITHIN}"
+    overlapping = connection.execute(query, within(twin, int(instants[0]), int(instants[-1]) + 1)).fetchall()
+    spans = np.array(overlapping, dtype=np.int64).reshape(-1, 3)
+    hit = np.searchsorted(instants, spans[:, 1]) < np.searchsorted(instants, spans[:, 2], side="right")
+    if not hit.any():
+        return np.empty(0, dtype=np.int64), np.empty((n_rows, 0))
+    ids = ",".join(map(str, spans[hit, 0].tolist()))
+    query = f"SELECT id, first_us, time FROM chunk WHERE id IN ({ids}) AND first_us >= ? AND first_us <= ?"
+    chunks = connection.execute(query, (int(spans[hit, 1].min()), int(spans[hit, 1].max()))).fetchall()
+    stored = [np.frombuffer(time, dtype="<i8") for _, _, time in chunks]
+    times, values = [np.empty(0, dtype=np.int64)], [np.empty((n_rows, 0))]
+    for (*place, _), time_us, wanted in zip(chunks, stored, _found_in(stored, instants), strict=True):
+        if wanted.any():
+            (value,) = connection.execute("SELECT value FROM chunk WHERE id = ? AND first_us = ?", place).fetchone()
+            times.append(time_us[wanted])
+            values.append(matrix(value, n_rows, wanted.size)[:, wanted])
+    time_us, known = np.concatenate(times), np.concatenate(values, axis=1)
+    return collapse(time_us, known) if time_us.size else (time_us, known)
+
+
+def _found_in(stored: list[NDArray[np.int64]], instants: NDArray[np.int64]) -> list[NDArray[np.bool_]]:
+    """Return for each array which of its elements are among some instants, which increase; all arrays at once."""
+    if not stored:
+        return []
+    joined = np.concatenate(stored)
+    place = np.searchsorted(instants, joined)
+    found = instants[np.minimum(place, instants.size - 1)] == joined
+    if not found.any():
+        return [np.zeros(0, dtype=np.bool_)] * len(stored)
+    return np.split(found, np.cumsum([time_us.size for time_us in stored[:-1]]))
