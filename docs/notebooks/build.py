@@ -19,9 +19,7 @@ def cells_of(script: str) -> list[tuple[str, str]]:
     found = []
     for head, body in re.findall(r"^# %%(.*)\n((?:(?!# %%).*\n?)*)", script, re.MULTILINE):
         if "markdown" in head:
-            found.append(
-                ("markdown", "\n".join(line.removeprefix("# ").removeprefix("#") for line in body.strip().splitlines()))
-            )
+            found.append(("markdown", re.sub("^# ?", "", body.strip(), flags=re.MULTILINE)))
         else:
             found.append(("code", body.strip()))
     return found

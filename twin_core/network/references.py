@@ -1,6 +1,6 @@
 """Whether what a specification names is declared, and declared once: every reference that is broken, in words."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from twin_core.network.formula import channels_of
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 def broken_references(spec: "TwinSpec") -> Iterable[str]:
     """Yield every broken reference; the first becomes the headline."""
     nodes = [node.id for node in spec.nodes]
-    yield from (f"nodes[{i}].id: '{n}' is declared twice" for i, n in enumerate(nodes) if n in nodes[:i])
+    yield from _twice(nodes)
     yield from (f"boundaries.{name}: a node has the same id" for name in spec.boundaries if name in nodes)
     for name, boundary in spec.boundaries.items():
         if boundary.channel is not None:
@@ -49,7 +49,7 @@ def broken_references(spec: "TwinSpec") -> Iterable[str]:
 
 
 def unknown_names(data: Mapping[str, Any]) -> Iterable[str]:
-    """Yield names that data declare nowhere, where other faults keep them from being a specification.
+    """Yield names that data declare nowhere, or twice, where other faults keep them from being a specification.
 
     What has not the form that it should have is passed over: those faults are told already.
     """
@@ -67,6 +67,7 @@ def unknown_names(data: Mapping[str, Any]) -> Iterable[str]:
         return [str(name) for name in declared] if isinstance(declared, Mapping) else []
 
     nodes = [str(entry.get("id")) for _, entry in entries("nodes")]
+    yield from _twice(nodes)
     ends, channels = [*nodes, *keys("boundaries")], [*keys("channels"), *keys("derived")]
     for field in ("conductors", "radiation"):
         for i, entry in entries(field):
@@ -85,6 +86,10 @@ def unknown_names(data: Mapping[str, Any]) -> Iterable[str]:
         read = entry.get("sensor")
         for name in read if isinstance(read, list) else [] if read is None else [read]:
             yield from _end(f"nodes[{i}].sensor", str(name), channels, "channel")
+
+
+def _twice(nodes: Sequence[str]) -> Iterable[str]:
+    return (f"nodes[{i}].id: '{n}' is declared twice" for i, n in enumerate(nodes) if n in nodes[:i])
 
 
 def _unseen(spec: "TwinSpec") -> Iterable[str]:

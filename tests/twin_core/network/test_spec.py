@@ -81,6 +81,14 @@ def test_what_holds_between_samples(tmp_path: Path, channel: str, is_held: bool)
     assert load_spec(tmp_path / "a.yaml").channels[channel].is_held is is_held
 
 
+def test_what_stands_twice_is_told_beside_faults_of_form(pair: dict[str, Any]) -> None:
+    pair["nodes"][1]["id"] = pair["nodes"][0]["id"]
+    pair["channels"]["T_a"]["unit"] = "furlong"
+    with pytest.raises(SpecError) as told:
+        load_spec(pair)
+    assert {"channels.T_a", "nodes[1].id"} <= {line.split(": ")[0] for line in told.value.problems}
+
+
 def test_unused_temperature_channel_is_no_demand(pair: dict[str, Any]) -> None:
     pair["channels"]["T_spare"] = {"kind": "temperature", "unit": "K"}
     assert "T_spare" not in load_spec(pair).used_channels
