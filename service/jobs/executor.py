@@ -5,6 +5,7 @@ it. Here a task that crashes, hangs or is cancelled harms nobody else.
 """
 
 import contextlib
+import ctypes
 import importlib
 import math
 import multiprocessing
@@ -27,6 +28,9 @@ from twin_core._typing import Progress, no_progress
 from twin_core.errors import TwinError
 
 T = TypeVar("T")
+
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
+"""Gives freed memory back to the system: the GNU allocator keeps what lies between arrays that are still in use."""
 
 END_GRACE_S = 2.0
 POLL_S = 0.2
@@ -216,6 +220,8 @@ def _run(connection: Connection, name: str, args: tuple[Any, ...]) -> None:
         function = getattr(function, part)
 
     def progress(fraction: float, message: str) -> None:
+        if _TRIM is not None:
+            _TRIM(0)
         connection.send(("progress", float(fraction), str(message)))
 
     answer: tuple[Any, ...]

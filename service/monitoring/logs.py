@@ -9,6 +9,8 @@ import orjson
 
 _QUERY = re.compile(r"\?[^\s\"']+")
 """A query in a line of the HTTP server may hold a key."""
+REFUSED_SOCKET = "ASGI callable returned without completing handshake."
+"""What uvicorn 0.54 says as an error of every web socket that was refused with a response, though it told so before."""
 _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName", "color_message"}
 
 
@@ -34,6 +36,7 @@ def start_logging(level: str) -> None:
     """Send the service's and the server's logs to stderr."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines())
+    handler.addFilter(lambda record: record.msg != REFUSED_SOCKET)
     for name in ("service", "uvicorn"):
         logger = logging.getLogger(name)
         logger.handlers = [handler]

@@ -166,3 +166,4 @@ def test_strangers_and_unknown_twins_are_refused(tmp_path: Path) -> None:
             assert socket.subprotocol == "bearer.r"
         with connect(socket_url(server, "benchsat"), additional_headers=key):
             pass
+        assert "connection rejected (401" in server.log() and '"level":"error"' not in server.log()
