@@ -165,10 +165,11 @@ def _print(report: dict[str, Any]) -> None:
             short(p["corrected"]["mean"], 4),
             short(p["corrected"]["std"], 2),
             p["unit"],
+            "identified" if p["identified"] else "not identified",
         ]
         for p in report["parameters"]
         if p["identified"] is not None
     ]
-    print_table("parameters", ["parameter", "declared", "correlated", "±", "unit"], parameters)
+    print_table("parameters", ["parameter", "declared", "correlated", "±", "unit", ""], parameters)
     for words in report["words"]:
         print_line(words)

@@ -22,11 +22,14 @@ from twin_core.calibrate.second_order import (
     to_model,
     with_met,
 )
+from twin_core.calibrate.starting import table_levels
 from twin_core.calibrate.statistics import score, spread_of
 from twin_core.errors import ModelError, TelemetryError
+from twin_core.network.calibrated import with_values
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
+from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
 from twin_core.simulate.forcing import build_forcing
 from twin_core.telemetry import Record
@@ -201,6 +204,9 @@ def correlate(
         raise TelemetryError(f"{twice}: two phases have this name; each counts once")
     stated = _with_noise(spec, [phase.record for phase in phases if not phase.steady])
     records = [phase.record for phase in phases]
+    unseen: tuple[str, ...] = ()
+    if all(phase.steady for phase in phases):
+        stated, unseen = _with_capacities_held(stated, records)
     held: tuple[str, ...] = ()
     if most_free is not None:
         progress(0.0, "choosing what to vary")
@@ -228,7 +234,7 @@ def correlate(
         "parameters": _rows(model, calibration),
         "correlations": model.summary["correlations"],
         "words": [line for line in model.summary["words"] if "never changes" not in line],
-        "notices": [*_told_held(held), *model.summary["notices"]],
+        "notices": [*_told_unseen(unseen), *_told_held(held), *model.summary["notices"]],
     }
     plots = {
         phase.name: _series(spec, phase, measured, tables) for phase, measured, tables in of_phases if not phase.steady
@@ -242,13 +248,35 @@ def _over_all(spec: TwinSpec, measured_K: Sequence[FloatArray], read_K: Mapping[
     return {**scores, "criteria": {when: acceptance(spec, row["per_sensor"]) for when, row in scores.items()}}
 
 
+def _with_capacities_held(spec: TwinSpec, records: Sequence[Record]) -> tuple[TwinSpec, tuple[str, ...]]:
+    """Hold capacities at their guesses; return their names too.
+
+    Readings at rest tell nothing of them, but a fit would make them large where a phase is not met exactly: the model then
+    lingers at its initial temperatures, which are fitted.
+    """
+    network = build_network(spec, table_knots=table_levels(spec, records))
+    parameters = network.parameters
+    own = {parameters.ties.get(int(index), (int(index), 1.0))[0] for index in network.capacity_index}
+    names = [parameters.parameters[int(index)].name for index in parameters.free_index if int(index) in own]
+    values = parameters.as_dict()
+    return load_spec(with_values(spec, {name: values[name] for name in names})), tuple(names)
+
+
+def _told_unseen(names: Sequence[str]) -> list[str]:
+    """Return what to say of capacities that no transient tells."""
+    return [f"capacities keep their guesses, for phases at rest tell nothing of them: {_some(names)}"] if names else []
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
+
+
 def _told_held(names: Sequence[str]) -> list[str]:
     """Return what to say of parameters that were not varied."""
     if not names:
         return []
-    shown = ", ".join(names[:MOST_NAMED]) + (f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else "")
     kept = "1 parameter keeps its guess" if len(names) == 1 else f"{len(names)} parameters keep their guesses"
-    return [f"{kept}, for the sensors tell more of the others: {shown}"]
+    return [f"{kept}, for the sensors tell more of the others: {_some(names)}"]
 
 
 def _series(spec: TwinSpec, phase: Phase, measured_K: FloatArray, tables: Mapping[str, FloatArray]) -> Json:

@@ -35,6 +35,9 @@ DECISIVE_STD = 3.0
 PULSE_SHARES = (0.25, 0.5)
 """The part of the stretch in which an input is moved."""
 
+LONG_S = 7200.0
+"""From this duration on, in s, words tell it in hours."""
+
 WARMER_K = 10.0
 N_DRAWS = 1000
 """Readings that are drawn from each option: the gain is good to some 0.02 bit."""
@@ -165,7 +168,7 @@ def plans(spec: TwinSpec, record: Record) -> Iterator[Plan]:
             moves = [(f"{boundaries[name]} {warmer:.0f} K warmer", column + warmer, warmer)] if warmer > 0.0 else []
         elif channel.kind == "power":
             moves = [
-                ("off" if end == 0.0 else f"held at {end:.4g}", np.full_like(column, end), end) for end in (low, high)
+                ("off" if end == 0.0 else f"held at {end:.4g} W", np.full_like(column, end), end) for end in (low, high)
             ]
             moves = [(f"{name} {words}", values, end) for words, values, end in moves]
         elif channel.kind == "auxiliary":
@@ -176,7 +179,8 @@ def plans(spec: TwinSpec, record: Record) -> Iterator[Plan]:
             during = record.time_s >= record.time_s[-1] - share * span_s
             moved = {**record.values, name: np.where(during, values, column)}
             duration_s = share * span_s
-            yield Plan(f"{words} for {duration_s:.0f} s", replace(record, values=moved), name, end, duration_s)
+            told = f"{duration_s:.0f} s" if duration_s < LONG_S else f"{duration_s / 3600.0:.3g} h"
+            yield Plan(f"{words} for {told}", replace(record, values=moved), name, end, duration_s)
 
 
 def _range(spec: TwinSpec, name: str, column: FloatArray) -> tuple[float, float]:

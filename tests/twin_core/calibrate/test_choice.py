@@ -61,4 +61,5 @@ def test_phases_at_rest_tell_of_conductances_alone() -> None:
         "G:a|b",
         "G:b|plate",
     }
-    assert found.report["notices"][0].startswith("4 parameters keep their guesses")
+    assert found.report["notices"][0].startswith("capacities keep their guesses")
+    assert found.report["notices"][1].startswith("1 parameter keeps its guess")

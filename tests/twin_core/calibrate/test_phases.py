@@ -94,6 +94,29 @@ def test_one_conductance_from_two_phases_at_rest_is_ohms_law() -> None:
     assert found.report["after"]["rmse_K"] < 0.02 < 1.0 < found.report["before"]["rmse_K"]
 
 
+def test_phases_at_rest_that_one_conductance_cannot_meet_leave_capacities_alone() -> None:
+    """T = T_wall + Q / G meets neither phase exactly: a large capacity would let the model linger at the readings."""
+    data = {
+        "twin": "one",
+        "boundaries": {"wall": {"channel": "T_wall"}},
+        "channels": {
+            "T": {"kind": "temperature", "unit": "degC", "noise_std": 0.1},
+            "T_wall": {"kind": "temperature", "unit": "degC"},
+            "Q": {"kind": "power", "unit": "W"},
+        },
+        "nodes": [{"id": "a", "sensor": "T", "capacity_J_per_K": {"guess": 500.0}}],
+        "conductors": [{"between": ["a", "wall"], "conductance_W_per_K": {"guess": 1.0}}],
+        "loads": [{"channel": "Q", "node": "a"}],
+    }
+    declared = load_spec(data)
+    read = {"hot": {"T": 45.1, "T_wall": 20.0, "Q": 20.0}, "cold": {"T": -5.0, "T_wall": -20.0, "Q": 12.0}}
+    found = correlate(declared, [at_rest(declared, name, values) for name, values in read.items()])
+    assert found.model.values["C:a"] == 500.0
+    assert any("C:a" in notice for notice in found.report["notices"])
+    least_squares = (20.0**2 + 12.0**2) / (25.1 * 20.0 + 15.0 * 12.0)
+    assert found.model.values["G:a|wall"] == pytest.approx(least_squares, rel=1e-3)
+
+
 def test_one_sensor_on_many_nodes_at_rest_tells_a_conductance() -> None:
     """All nodes hang on the one that has the sensor, so that each is as warm as it: G = Q / (T - T_wall)."""
     hidden = [f"n{i}" for i in range(60)]
