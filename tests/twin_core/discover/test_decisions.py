@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin_core.discover import judge, policy
-from twin_core.discover import search as searching
+from twin_core.discover import judge, policy, revision
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
@@ -44,7 +43,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import exchange, reconsider, withdraw
+from twin_core.discover.revision import exchange, reconsider, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -273,8 +272,8 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
         names = {e.where["node"] for e in effects}
         return stub(*effects, left=left + sum(value for name, value in own.items() if name not in names))
 
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
     state.findings = [Finding(judged(name, 50.0)) for name in own]
     withdraw(state, NEEDED)
@@ -286,8 +285,8 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
 def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """As an ablation sets them."""
     monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(stub(load("n0"), left=1.0), stub(left=1.0), findings=[Finding(judged("n0", 50.0))])
     withdraw(state, NEEDED)
     assert state.findings
@@ -313,15 +312,15 @@ def test_of_effects_found_together_each_must_explain_something(
         names = {e.where["node"] for e in effects}
         return stub(*effects, left=left + sum(value for name, value in parts.items() if name not in names))
 
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     asked: list[tuple[Effect, ...]] = []
 
     def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         asked.append(option.effects)
         return replace(option, reason=reason), False
 
-    monkeypatch.setattr(searching, "examine", examined)
+    monkeypatch.setattr(revision, "examine", examined)
     both = (load("n0"), load("n1"))
     state = Search(refitted(both), refitted(()))
     state.findings = [Finding(Judged(both, Evidence(50.0, 0.0), state.trial))]
@@ -334,7 +333,7 @@ def test_of_effects_found_together_each_must_explain_something(
 def test_beside_a_heat_without_a_name_all_that_stays_counts(
     monkeypatch: pytest.MonkeyPatch, explained: float, stands: bool
 ) -> None:
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     free = unnamed()
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
     state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
@@ -477,11 +476,11 @@ def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
 def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
     monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
 ) -> None:
-    monkeypatch.setattr(searching, "touched_nodes", lambda effect, layout: {effect.where["node"]})
-    monkeypatch.setattr(searching, "_attempted_without", lambda state, places: (stub(), 30.0))
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(searching, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    monkeypatch.setattr(revision, "touched_nodes", lambda effect, layout: {effect.where["node"]})
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 30.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
     found = kind_at("heat_load_step", "n0", 30.0)
     cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
     refused = replace(option, reason=NO_FORESIGHT)

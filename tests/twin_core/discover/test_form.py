@@ -10,8 +10,8 @@ from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
 from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
+from twin_core.discover.revision import prune
 from twin_core.discover.screen import screen, survey_of
-from twin_core.discover.search import prune
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.proportional_heater import ProportionalHeater
