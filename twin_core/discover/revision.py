@@ -11,7 +11,6 @@ from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import by_chance, least_explained
 from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
 from twin_core.discover.judge import (
-    NO_LAW,
     NO_MORE,
     OUTDONE,
     SMALL_REMAINDER,
@@ -25,7 +24,7 @@ from twin_core.discover.judge import (
 from twin_core.effects.base import touched_nodes
 
 N_EXCHANGED = 2
-"""Refused options that are tried in the place of a finding."""
+"""Refused options that are tried in the place of a finding, or of none."""
 
 
 def withdraw(state: Search, needed: float) -> None:
@@ -135,30 +134,30 @@ def prune(state: Search, needed: float) -> None:
 
 
 def reconsider(state: Search, needed: float) -> None:
-    """Name an option that was refused for the heat that it leaves, if what was found instead is no better.
+    """Name an option that was refused for the little heat that it leaves, if what was found instead is no better.
 
-    What it leaves is little, and nothing or a heat without a name was found; or it leaves much, and a name was found that
-    leaves no such heat and yet is less likely and predicts worse: whichever law holds there, that one does not.
+    Nothing was found, a heat without a name, or one name that is less likely and predicts worse. The likeliest such option is
+    named that stands whole: what a part of it explains beside a coarse network may be no effect of its own.
     """
     if len(state.findings) > 1:
         return
-    is_named = any(not effect.fallback for finding in state.findings for effect in finding.effects)
-    reasons = (SMALL_REMAINDER, NO_LAW) if is_named else (SMALL_REMAINDER,)
-    near = [j for j in state.rejected if j.reason in reasons and len(j.trial.effects) == len(j.effects)]
-    if is_named:
-        near = [
-            j for j in near if all(worth(j) < worth(f.judged) and foresight_of(j) < f.foresight for f in state.findings)
-        ]
-    if not near:
-        return
-    best = min(near, key=worth)
-    rest = [j for j in state.rejected if j.effects != best.effects]
-    named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
-    withdraw(named, needed)
-    if named.findings and all(_is_better(named.findings[0], other) for other in state.findings):
-        if is_named:
-            named.rejected += [replace(f.judged, reason=OUTDONE) for f in state.findings]
-        state.join(named)
+    named = [f for f in state.findings if not all(effect.fallback for effect in f.effects)]
+    little = [
+        j
+        for j in state.rejected
+        if j.reason == SMALL_REMAINDER
+        and len(j.trial.effects) == len(j.effects)
+        and all(worth(j) < worth(f.judged) and foresight_of(j) < f.foresight for f in named)
+    ]
+    for option in sorted(little, key=worth)[:N_EXCHANGED]:
+        rest = [j for j in state.rejected if j.effects != option.effects]
+        instead = replace(state, trial=option.trial, findings=[Finding(replace(option, reason=""))], rejected=rest)
+        withdraw(instead, needed)
+        stands_whole = [len(f.effects) for f in instead.findings] == [len(option.effects)]
+        if stands_whole and all(_is_better(instead.findings[0], other) for other in state.findings):
+            instead.rejected += [replace(f.judged, reason=OUTDONE) for f in named]
+            state.join(instead)
+            return
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

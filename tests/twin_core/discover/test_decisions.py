@@ -1,5 +1,6 @@
 """The deciding rooms at their boundaries: what is likely enough, what predicts, what stands, and what goes first."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from threading import Barrier, Thread
 from types import SimpleNamespace
@@ -445,16 +446,36 @@ def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
     ],
     ids=["likelier and predicts better", "less likely", "predicts worse"],
 )
-def test_no_name_stands_that_one_refused_for_what_it_leaves_excels(
+def test_no_name_stands_that_one_refused_for_the_little_it_leaves_excels(
     nats: float, foresight: float, names: list[str]
 ) -> None:
-    """Whichever law holds there, a name that is less likely and predicts worse than one that is no law does not."""
+    """Less likely, and it predicts worse: what the other one leaves is no reason to name this one."""
     found = judged("f", 70.0, foresight=0.6)
     state = Search(found.trial, stub(), findings=[Finding(found)])
-    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=NO_LAW)]
+    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=SMALL_REMAINDER)]
     reconsider(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == names
-    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [NO_LAW])
+    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [SMALL_REMAINDER])
+
+
+def test_what_stands_in_part_only_gives_way_to_what_stands_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the likelier pair one effect explains next to nothing: its other half is no answer to what the pair was found for."""
+    left = 2.0 * CHANCE
+
+    def refitted(effects: Sequence[Effect]) -> Trial:
+        names = {str(e.where["node"]) for e in effects}
+        return stub(*effects, left=left + (0.0 if names & {"a", "c"} else 99.0))
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (judged, False))
+    both = (load("a"), load("b"))
+    pair = Judged(both, Evidence(99.0, 0.0), refitted(both), None, SMALL_REMAINDER)
+    single = Judged((load("c"),), Evidence(70.0, 0.0), refitted([load("c")]), None, SMALL_REMAINDER)
+    state = Search(refitted(()), refitted(()), rejected=[pair, single])
+    reconsider(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == ["c"]
+    assert pair in state.rejected and single not in state.rejected
 
 
 def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
