@@ -24,7 +24,10 @@ from twin_core.discover.judge import (
 from twin_core.effects.base import touched_nodes
 
 N_EXCHANGED = 2
-"""Refused options that are tried in the place of a finding, or of none."""
+"""Refused options that are tried in the place of a finding."""
+
+N_RECONSIDERED = 4
+"""Options refused for the little that they leave that are looked at once more."""
 
 
 def withdraw(state: Search, needed: float) -> None:
@@ -149,7 +152,7 @@ def reconsider(state: Search, needed: float) -> None:
         and len(j.trial.effects) == len(j.effects)
         and all(worth(j) < worth(f.judged) and foresight_of(j) < f.foresight for f in named)
     ]
-    for option in sorted(little, key=worth)[:N_EXCHANGED]:
+    for option in sorted(little, key=worth)[:N_RECONSIDERED]:
         rest = [j for j in state.rejected if j.effects != option.effects]
         instead = replace(state, trial=option.trial, findings=[Finding(replace(option, reason=""))], rejected=rest)
         withdraw(instead, needed)
