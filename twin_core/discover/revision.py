@@ -140,9 +140,10 @@ def reconsider(state: Search, needed: float) -> None:
     """Name an option that was refused for the little heat that it leaves, if what was found instead is no better.
 
     Nothing was found, a heat without a name, or one name that is less likely and predicts worse. The likeliest such option is
-    named that stands whole: what a part of it explains beside a coarse network may be no effect of its own.
+    named that stands whole: what a part of it explains beside a coarse network may be no effect of its own. A search that was
+    cut short may have left out a better one, so that what it refused stays refused.
     """
-    if len(state.findings) > 1:
+    if len(state.findings) > 1 or state.left_out:
         return
     named = [f for f in state.findings if not all(effect.fallback for effect in f.effects)]
     little = [
