@@ -395,7 +395,10 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     simple = stub(left=10.0 if left == 1.0 else left)
     monkeypatch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: beside)
     monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
     assert judge._merely_resembles(simple, option, NEEDED) == reason
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: True)
+    assert judge._merely_resembles(simple, option, NEEDED) == ""
 
 
 def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
@@ -403,6 +406,7 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
     lag = REGISTRY["sensor_lag"]({"sensor": "T"}, {"tau_s": 30.0})
     option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
         patch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: 1e9)
         patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
