@@ -1,8 +1,8 @@
 """What a large archive costs: jobs, memory, answers, exports, residuals on disk, deletion, a vast specification.
 
 A million frames of twelve channels, sampled once a second, are ingested by a real server process; then each figure of
-``docs/service.md#room`` is taken. ``python -m benchmarks.service_years [--frames N]`` writes
-``benchmarks/tables/service_years.md``.
+``docs/service.md#room`` is taken, and 100,000 frames of two hundred channels, sampled once a minute, are calibrated.
+``python -m benchmarks.service_years [--frames N]`` writes ``benchmarks/tables/service_years.md``.
 """
 
 import argparse
@@ -27,21 +27,25 @@ from service.client import TwinClient
 from service.jobs.executor import resident_MiB
 
 Row = list[str]
-PIECE = 2000
-N_NODES = 11
+VALUES_IN_PIECE = 24_000
+N_NODES, N_WIDE = 11, 199
+WIDE_FRAMES = 100_000
+DAY_S = 84_000
 
 
-def frames(count: int) -> Iterator[bytes]:
-    """Yield bodies with samples of a chain of nodes, a second apart: a day that repeats, with noise of its own."""
-    life.N_NODES, life.STEP_S = N_NODES, 60.0
+def frames(count: int, n_nodes: int = N_NODES, step_s: int = 1) -> Iterator[bytes]:
+    """Yield bodies with samples of a chain of nodes: a day that repeats, to its end, with noise of its own."""
+    life.N_NODES, life.STEP_S = n_nodes, 60.0
     _, values = life.orbits(1500)
     generator = np.random.default_rng(3)
     minutes = np.arange(1500) * 60.0
-    for first in range(0, count, PIECE):
-        second = np.arange(first, min(first + PIECE, count))
-        made = {"Q": np.interp(second % 84_000, minutes, values["Q"]).round(1).tolist()}
-        for k in range(N_NODES):
-            smooth = np.interp(second % 84_000, minutes, values[f"T_n{k}"])
+    piece = VALUES_IN_PIECE // (n_nodes + 1)
+    for first in range(0, count, piece):
+        second = step_s * np.arange(first, min(first + piece, count))
+        of_day = (second - step_s * count) % DAY_S
+        made = {"Q": np.interp(of_day, minutes, values["Q"]).round(1).tolist()}
+        for k in range(n_nodes):
+            smooth = np.interp(of_day, minutes, values[f"T_n{k}"])
             made[f"T_n{k}"] = (smooth + generator.normal(0.0, 0.05, second.size)).round(3).tolist()
         yield json.dumps({"time": second.tolist(), "values": made}).encode()
 
@@ -95,12 +99,12 @@ def most_memory(folder: Path) -> Iterator[dict[str, float]]:
         thread.join()
 
 
-def job(client: TwinClient, folder: Path, kind: str, target: str, **settings: Any) -> Row:
+def job(client: TwinClient, folder: Path, kind: str, target: str, twin: str = "chain", **settings: Any) -> Row:
     """Measure one job."""
     begun_s = time.perf_counter()
     with most_memory(folder) as memory:
         start = client.calibrate if kind == "calibration" else client.diagnose
-        made = client.wait("chain", start("chain", **settings))
+        made = client.wait(twin, start(twin, **settings))
     assert made.state == "succeeded", made.message
     said = made.message.partition("; from ")[2]
     took_s = time.perf_counter() - begun_s
@@ -136,6 +140,18 @@ def answers(url: str, folder: Path) -> list[Row]:
     return rows
 
 
+def wide(url: str, folder: Path) -> list[Row]:
+    """Measure ingest and calibration of many channels."""
+    with TwinClient(url, timeout_s=300.0) as client:
+        client.register(chain("wide", N_WIDE))
+        begun_s = time.perf_counter()
+        post_all(url, "/v1/twins/wide/telemetry", list(frames(WIDE_FRAMES, N_WIDE, 60)), [])
+        took_s = time.perf_counter() - begun_s
+        what = f"{WIDE_FRAMES:,} frames of {N_WIDE + 1} channels"
+        row = job(client, folder, "calibration", "≤ 300 s", "wide")
+        return [[f"ingest of {what}", f"{took_s:.0f} s", ""], [f"{what}: {row[0]}", *row[1:]]]
+
+
 def vast(url: str) -> Row:
     """Measure what a specification of ten thousand nodes, which is refused, and one of two thousand do to others."""
     figures = []
@@ -165,15 +181,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=1_000_000)
     parser.add_argument("--without-diagnosis", action="store_true", help="leave out what takes longest")
+    parser.add_argument(
+        "--only-wide", action="store_true", help="only calibrate the two hundred channels; writes no table"
+    )
     given = parser.parse_args()
     count = given.frames
     load = os.getloadavg()[0]
     rows = _Told()
+    if given.only_wide:
+        with tempfile.TemporaryDirectory() as name, running(["-m", "service"], Path(name)) as url:
+            for row in wide(url, Path(name)):
+                rows.append(row)
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = folder / "bench.sqlite3"
         with running(["-m", "service"], folder) as url, TwinClient(url, timeout_s=300.0) as client:
-            client.register(life_chain())
+            client.register(chain("chain"))
             begun_s = time.perf_counter()
             post_all(url, "/v1/twins/chain/telemetry", list(frames(count)), [])
             rows.append(
@@ -211,7 +235,8 @@ def main() -> None:
                     "residuals ≤ archive",
                 ]
             )
-            rows += answers(url, folder)
+            for row in (*answers(url, folder), *wide(url, folder)):
+                rows.append(row)
             rows.append(vast(url))
             with stalls(url) as latencies_s:
                 begun_s = time.perf_counter()
@@ -228,10 +253,10 @@ def main() -> None:
     print(table)
 
 
-def life_chain() -> dict[str, Any]:
-    """Return the chain with as many nodes as this benchmark has sensors."""
-    life.N_NODES = N_NODES
-    return life.chain()
+def chain(twin: str, n_nodes: int = N_NODES) -> dict[str, Any]:
+    """Return a twin of so many nodes in a row, each of which has a sensor."""
+    life.N_NODES = n_nodes
+    return {**life.chain(), "twin": twin}
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Typed clients of the service, synchronous and asynchronous, with retries.
 
-A lost connection or an overloaded service is tried again with growing pauses, as long as sending the request twice
-does no harm (samples are recognised when they come again). Any other refusal raises ``ApiError`` at once.
+A lost connection, an overloaded service and what is not known yet are tried again with growing pauses, as long as sending
+the request twice does no harm (samples are recognised when they come again). Any other refusal raises ``ApiError`` at once.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ def _read(response: httpx.Response, answer: type[T]) -> T:
 
 def _may_retry(call: Call[T], outcome: httpx.Response | httpx.TransportError) -> bool:
     if isinstance(outcome, httpx.Response):
-        return outcome.status_code in RETRIED
+        return outcome.status_code in RETRIED or "Retry-After" in outcome.headers
     return call.repeatable or isinstance(outcome, httpx.ConnectError | httpx.ConnectTimeout)
 
 

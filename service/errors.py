@@ -30,6 +30,10 @@ class TooLittle(Refusal):
     """What is asked for needs more telemetry than there is."""
 
 
+class NotYet(Refusal):
+    """What is asked for is being worked on: whoever asks again a little later finds it."""
+
+
 class TooMuch(Refusal):
     """So much of it waits already that no more is taken now."""
 

@@ -9,7 +9,7 @@ A handful of functions over the framework in ``twin_core``, with data frames in 
 >>> tt.forecast(loop.model, record, "1d")             # doctest: +SKIP
 """
 
-from thermal_twin.frames import from_dataframe, to_dataframe
+from thermal_twin.frames import Record
 from thermal_twin.reading import read, save
 from thermal_twin.work import calibrate, close_loop, forecast, plot, simulate
 from twin_core import __version__
@@ -17,7 +17,6 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.closed_loop import ClosedLoop
 from twin_core.errors import TwinError
 from twin_core.network.spec import TwinSpec
-from twin_core.telemetry import Record
 
 __all__ = [
     "CalibratedModel",
@@ -29,10 +28,8 @@ __all__ = [
     "calibrate",
     "close_loop",
     "forecast",
-    "from_dataframe",
     "plot",
     "read",
     "save",
     "simulate",
-    "to_dataframe",
 ]

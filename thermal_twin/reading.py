@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import overload
 
+from thermal_twin.frames import Record
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.closed_loop import ClosedLoop
 from twin_core.errors import TelemetryError
@@ -10,7 +11,6 @@ from twin_core.files import write_text
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec, read_mapping
-from twin_core.telemetry import Record
 from twin_core.telemetry_csv import read_csv
 
 
@@ -44,7 +44,7 @@ def read(path: str | Path, spec: TwinSpec | None = None) -> TwinSpec | Calibrate
     if path.suffix == ".csv":
         if spec is None:
             raise TelemetryError(f"{path}: telemetry needs a specification: tt.read({str(path)!r}, spec)")
-        return screened(spec, read_csv(path, spec))
+        return Record.of(screened(spec, read_csv(path, spec)), spec)
     if spec is not None:
         raise TelemetryError(f"{path}: telemetry is read from CSV here; twin record and twin simulate write it")
     data = read_mapping(path)

@@ -10,7 +10,8 @@ import pandas as pd
 import twin_core.calibrate
 import twin_core.closed_loop
 import twin_core.forecast
-from thermal_twin.frames import from_dataframe, index_of
+import twin_core.telemetry
+from thermal_twin.frames import Record, index_of
 from twin_core._typing import FloatArray
 from twin_core.calibrate.problem import build_segment
 from twin_core.calibrate.result import CalibratedModel
@@ -21,20 +22,19 @@ from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
-from twin_core.telemetry import Record
 from twin_core.units import from_si
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Data: TypeAlias = Record | pd.DataFrame
+Data: TypeAlias = twin_core.telemetry.Record | pd.DataFrame
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86_400.0, "w": 604_800.0}
 
 
-def _records(spec: TwinSpec, data: Data | Sequence[Data]) -> list[Record]:
+def _records(spec: TwinSpec, data: Data | Sequence[Data]) -> list[twin_core.telemetry.Record]:
     """Return records of whatever telemetry is given in; several are segments of their own."""
-    many = [data] if isinstance(data, Record | pd.DataFrame) else list(data)
-    return [item if isinstance(item, Record) else from_dataframe(item, spec) for item in many]
+    many = [data] if isinstance(data, twin_core.telemetry.Record | pd.DataFrame) else list(data)
+    return [Record.from_dataframe(item, spec) if isinstance(item, pd.DataFrame) else item for item in many]
 
 
 def calibrate(spec: TwinSpec, data: Data | Sequence[Data], **options: Any) -> CalibratedModel:
@@ -171,7 +171,9 @@ def simulate(
     return pd.DataFrame(table, columns=list(network.nodes), index=index_of(record, record.time_s))
 
 
-def _start_K(nodes: Sequence[str], record: Record, first_K: FloatArray, start_C: Mapping[str, float]) -> FloatArray:
+def _start_K(
+    nodes: Sequence[str], record: twin_core.telemetry.Record, first_K: FloatArray, start_C: Mapping[str, float]
+) -> FloatArray:
     unknown = [name for name in start_C if name not in nodes]
     if unknown:
         raise ModelError(f"unknown node '{unknown[0]}' (known: {', '.join(nodes)})")

@@ -2,7 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -93,21 +94,15 @@ class Record:
             raise TelemetryError(f"{self.name}: channel '{name}' is missing; the file has {', '.join(self.values)}")
         return self.values[name]
 
-    def between(self, start_s: float, stop_s: float) -> "Record":
+    def between(self, start_s: float, stop_s: float) -> Self:
         """Return the samples with start_s <= time_s < stop_s; TelemetryError if there are none."""
         keep = (self.time_s >= start_s) & (self.time_s < stop_s)
         return self.take(keep)
 
-    def take(self, keep: np.ndarray) -> "Record":
+    def take(self, keep: np.ndarray) -> Self:
         """Return the samples that the mask or index ``keep`` selects."""
-        return Record(
-            self.time_s[keep],
-            {name: column[keep] for name, column in self.values.items()},
-            self.epoch_ns,
-            self.name,
-            self.notices,
-            self.flaws,
-        )
+        values = {name: column[keep] for name, column in self.values.items()}
+        return replace(self, time_s=self.time_s[keep], values=values)
 
     @property
     def epoch_s(self) -> float:
@@ -131,7 +126,7 @@ class Record:
             return (parse_instant_ns(time) - self.epoch_ns) / 1e9
         return float(time)
 
-    def parts(self, longest_s: float, held: AbstractSet[str]) -> list["Record"]:
+    def parts(self, longest_s: float, held: AbstractSet[str]) -> list[Self]:
         """Return the record cut at intervals of more than ``longest_s``; ``held`` channels keep their values across."""
         starts = [0, *(np.flatnonzero(np.diff(self.time_s) > longest_s) + 1).tolist()]
         if len(starts) == 1:

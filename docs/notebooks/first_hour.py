@@ -69,12 +69,20 @@ spec = load_spec(
 spec
 
 # %% [markdown]
+# The frame and the specification make a record: units become SI, what can be no reading is left out, and
+# `telemetry.to_dataframe()` leads back.
+
+# %%
+telemetry = tt.Record.from_dataframe(flight, spec, name="bench")
+telemetry
+
+# %% [markdown]
 # ## Close the loop
 #
 # The last 30 % of the record is kept back: no choice sees it.
 
 # %%
-loop = tt.close_loop(spec, flight, holdout=0.3)
+loop = tt.close_loop(spec, telemetry, holdout=0.3)
 loop
 
 # %%
@@ -86,5 +94,5 @@ for finding in loop.report["findings"]:
 # ## Use it
 
 # %%
-ahead = tt.forecast(loop.model, flight, "6h")
+ahead = tt.forecast(loop.model, telemetry, "6h")
 ahead["T_box"].iloc[[0, 35, -1]].round(2)

@@ -50,6 +50,8 @@ class Gate:
             return None
         if self._keys.needed and key is None:
             return 401, "a valid API key is needed: send 'Authorization: Bearer KEY'"
+        if key is not None and key.is_over:
+            return 401, f"the API key of '{key.name}' has expired"
         if not self._keys.needed and not _is_local(scope.get("client")):
             return 403, "this service has no API keys, so it answers callers on its own machine only"
         host = headers.get(b"host", b"").decode("latin-1")

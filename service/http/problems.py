@@ -14,7 +14,7 @@ from starlette.responses import Response
 from starlette.routing import Match, Mount
 from starlette.types import Receive, Scope, Send
 
-from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, Refusal, TooLittle, TooMuch, short
+from service.errors import LONGEST_LINE, LONGEST_NAME, BadField, FieldErrors, NotYet, Refusal, TooLittle, TooMuch, short
 from service.live.engine import WorkerDied
 from service.store.errors import Conflicting, DiskFull, Missing, TwinGone, Unavailable
 from twin_core.errors import TwinError
@@ -98,7 +98,8 @@ TOLD = (Refusal, TwinError, TwinGone)
 def answer(error: Exception) -> Response:
     """Return the response for one of these errors."""
     if isinstance(error, Refusal):
-        return problem(status_of(error), error.detail, error.errors)
+        headers = {"Retry-After": "1"} if isinstance(error, NotYet) else None
+        return problem(status_of(error), error.detail, error.errors, headers)
     if isinstance(error, TwinGone):
         return problem(404, "the twin was deleted meanwhile")
     assert isinstance(error, TwinError)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import BadField, Refusal, short
+from service.errors import BadField, NotYet, Refusal, short
 from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
 from service.live.known import Known
@@ -21,6 +21,8 @@ from service.workbench.interface import Forecasted, ForecastTask, Telemetry
 
 SETTLE_S = 10.0
 """How long a forecast waits for samples that are stored but not yet assimilated."""
+FIRST_S = 15.0
+"""How much longer it waits where there is no state at all; clients wait 30 s for an answer."""
 MOST_POINTS = 20_000
 MOST_STEPS = 200_000
 PAST = 20_000
@@ -33,13 +35,16 @@ Json = dict[str, Any]
 
 
 async def state_of(tracker: Known) -> tuple[Active, Position]:
-    """Return the active model and its present state; Refusal if there is none."""
+    """Return the active model and its present state; Refusal if there is none, NotYet if it comes by itself."""
     settled = await tracker.settled(SETTLE_S)
+    if not settled and tracker.position is None:
+        settled = await tracker.settled(FIRST_S)
+    if not settled and tracker.position is None and tracker.trouble is None:
+        raise NotYet("the state is not known: the archive is still being assimilated; ask again")
     if tracker.active is None:
         raise Refusal("no model is active; calibrate first, or activate a version")
     if tracker.position is None:
-        reason = tracker.trouble or ("the archive is empty" if settled else "the archive is still being assimilated")
-        raise Refusal(f"the state is not known: {reason}")
+        raise Refusal(f"the state is not known: {tracker.trouble or 'the archive is empty'}")
     return tracker.active, tracker.position
 
 

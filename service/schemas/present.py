@@ -86,6 +86,7 @@ class Residuals(Answer):
     predicted: dict[str, list[float | None]] | None = Field(
         default=None, description="In the channels' units, if asked for and the answer is not too long."
     )
+    samples: int = Field(default=0, description="How many residuals there are in this span.")
     downsampled: bool = False
 
 

@@ -17,6 +17,14 @@ FLAGS = (
     "--disable-component-update --disable-sync --disable-dev-shm-usage --remote-debugging-port=0"
 ).split()
 
+TOASTS = """
+window.toasts = [];
+new MutationObserver((changes) => changes.forEach((change) => change.addedNodes.forEach((node) => {
+  if (node.classList?.contains("toast")) window.toasts.push(node.textContent);
+}))).observe(document, {childList: true, subtree: true});
+"""
+"""Remembers what a page says in passing: on a busy machine a toast has gone before anybody looks."""
+
 
 class Browser:
     """One page. Console errors and uncaught exceptions of the page are collected in ``troubles``."""
@@ -44,6 +52,7 @@ class Browser:
             raise
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
+        self.send("Page.addScriptToEvaluateOnNewDocument", source=TOASTS)
         self.resize(*self._size)
         return self
 
@@ -109,6 +118,10 @@ class Browser:
         while not self.evaluate(f"Boolean({expression})"):
             assert time.monotonic() < deadline_s, f"never true: {expression}; troubles: {self.troubles}"
             time.sleep(0.1)
+
+    def until_told(self, text: str) -> None:
+        """Return once a toast has said something."""
+        self.until(f"window.toasts.some((toast) => toast.includes({json.dumps(text)}))")
 
     def box(self, selector: str) -> tuple[float, float, float, float]:
         """Return left, top, width and height of an element."""

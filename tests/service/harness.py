@@ -1,11 +1,22 @@
 """A synchronous client of an application in the same process: requests run in one event loop, as in the server."""
 
 import contextlib
+import time
+from collections.abc import Callable
 from typing import Any
 
 import httpx
 from anyio.from_thread import start_blocking_portal
 from fastapi import FastAPI
+
+
+def until(found: Callable[[], Any], patience_s: float = 60.0) -> Any:
+    """Return what a question finds, once it finds something; AssertionError if it never does."""
+    until_s = time.monotonic() + patience_s
+    while not (answer := found()):
+        assert time.monotonic() < until_s, "it never came true"
+        time.sleep(0.05)
+    return answer
 
 
 class AppClient:

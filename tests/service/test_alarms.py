@@ -11,7 +11,7 @@ import pytest
 from service.workbench.interface import Forecasted, ForecastTask
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
-from tests.service.harness import AppClient
+from tests.service.harness import AppClient, until
 from tests.service.server import FAKE, Server
 from tests.service.test_live import messages
 
@@ -50,13 +50,15 @@ def send(client: AppClient, times: list[float], T_px: list[float], **more: list)
 
 def alarms(client: AppClient, count: int, **wanted: Any) -> list[dict]:
     """Return the alarms once there are so many of them that are as wanted."""
-    for _ in range(200):
+    found: list[dict] = []
+
+    def so_many() -> bool:
         rows = client.get(f"{TWIN}/alarms").json()["alarms"]
-        found = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
-        if len(found) == count:
-            return found
-        time.sleep(0.05)
-    raise AssertionError(f"not {count} of {wanted}: {rows}")
+        found[:] = [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+        return len(found) == count
+
+    until(so_many)
+    return found
 
 
 def test_a_reading_beyond_a_limit_raises_an_alarm_that_ends_with_a_dead_band(client: AppClient) -> None:

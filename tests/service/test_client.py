@@ -61,6 +61,14 @@ def test_refusals_are_not_repeated_and_name_the_field() -> None:
     assert len(seen) == 1
 
 
+def test_what_is_not_known_yet_is_asked_for_again() -> None:
+    seen: list[str] = []
+    not_yet = httpx.Response(409, json={"detail": "still being assimilated"}, headers={"Retry-After": "1"})
+    with make_client([not_yet, httpx.Response(200, json={"twins": []})], seen, []) as client:
+        assert client.twins() == []
+    assert len(seen) == 2
+
+
 def test_giving_up() -> None:
     with (
         make_client([httpx.ConnectError("refused")] * 4, [], []) as client,

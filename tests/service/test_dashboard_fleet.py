@@ -71,7 +71,7 @@ def test_a_fleet_of_a_thousand(server: Server, tmp_path: Path) -> None:
     with Browser(tmp_path / "profile", 1400, 1000) as page:
         page.open(server.url)
         page.until(f"{ROWS}.length === 50")
-        assert page.evaluate("document.getElementById('link-text').innerText") == "1,000 twins"
+        page.until("document.getElementById('link-text').innerText === '1,000 twins'")
         kinds = page.evaluate("[...document.querySelectorAll('.kind b')].map((b) => b.innerText)")
         assert kinds == ["1,000", "8", "0", "20", "25", "10", "5"]
         assert page.evaluate(f"{FIRST}.startsWith('sat-0560') && {FIRST}.includes('1 red')")

@@ -160,7 +160,7 @@ def _children(process: int) -> list[int]:
 
 
 def _wait_until_group_is_gone(group: int) -> None:
-    for _ in range(300):
+    for _ in range(1200):
         try:
             os.killpg(group, 0)
         except ProcessLookupError:

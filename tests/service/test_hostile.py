@@ -12,6 +12,7 @@ import httpx
 import pytest
 
 from tests.service.conftest import SPEC
+from tests.service.harness import until
 from tests.service.server import Server
 
 pytestmark = pytest.mark.e2e
@@ -171,8 +172,7 @@ def test_head_is_get_without_its_body(server: Server, path: str) -> None:
 def test_head_of_a_stream_ends(server: Server) -> None:
     answer = httpx.head(f"{server.url}/v1/twins/benchsat/events", timeout=5)
     assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
-    client = httpx.get(f"{server.url}/metrics")
-    assert "twin_stream_readers 0.0" in client.text
+    until(lambda: "twin_stream_readers 0.0" in httpx.get(f"{server.url}/metrics").text)
 
 
 def test_head_is_no_way_to_post(server: Server) -> None:

@@ -24,7 +24,7 @@ from service.settings import SettingsError, read_settings
 from service.store import schema
 from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
-from tests.service.harness import AppClient
+from tests.service.harness import AppClient, until
 from tests.service.server import FAKE, Server
 from tests.service.test_jobs import finish
 
@@ -76,6 +76,7 @@ def test_every_change_and_every_refused_key_is_on_record(make_client: Any, key_f
     ask(client, "ben-secret", "POST", f"{TWIN}/telemetry", json={"time": [1], "values": {"T_px": [290.0]}})
     ask(client, "ben-secret", "DELETE", TWIN)
     ask(client, "guessed", path="/v1/twins?access_token=guessed")
+    assert "'old' has expired" in ask(client, "old-secret").json()["detail"]
     ask(client, "anna-secret", "DELETE", f"{TWIN}/telemetry", params={"start": 0})
     assert ask(client, "ben-secret", path="/v1/audit").status_code == 403
     lines = ask(client, "anna-secret", path="/v1/audit").json()["audit"]
@@ -84,6 +85,7 @@ def test_every_change_and_every_refused_key_is_on_record(make_client: Any, key_f
         ("anna", "POST", "/v1/twins", 201),
         ("ben", "DELETE", TWIN, 403),
         ("unknown", "GET", "/v1/twins", 401),
+        ("old", "GET", "/v1/twins", 401),
         ("anna", "DELETE", f"{TWIN}/telemetry", 200),
         ("ben", "GET", "/v1/audit", 403),
     ]
@@ -110,14 +112,11 @@ def test_keys_in_queries_are_not_logged() -> None:
 
 @pytest.mark.e2e
 def test_a_hangup_reads_the_keys_again_and_ends_nothing(tmp_path: Path, key_file: Path) -> None:
-    with Server(tmp_path, command=FAKE, api_keys_file=str(key_file)) as server:
+    with Server(tmp_path, api_keys_file=str(key_file)) as server:
         assert server.client("anna-secret").register(SPEC).id == "benchsat"
         key_file.write_text("dora operate dora-secret\n")
         os.kill(server.process.pid, signal.SIGHUP)
-        for _ in range(100):
-            if server.client("dora-secret").send is not None and "dora" in server.log():
-                break
-            time.sleep(0.05)
+        until(lambda: "dora" in server.log())
         assert server.client("dora-secret").twin("benchsat").id == "benchsat"
         assert server.process.poll() is None
 
@@ -151,14 +150,6 @@ def receiver() -> Iterator[Receiver]:
     yield made
     made.server.shutdown()
     made.server.server_close()
-
-
-def until(found: Any) -> None:
-    for _ in range(200):
-        if found():
-            return
-        time.sleep(0.05)
-    raise AssertionError("it never came true")
 
 
 def test_webhooks_are_signed_tried_again_and_given_up(

@@ -6,8 +6,7 @@ import http.server
 import json
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from email.message import EmailMessage
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ import pytest
 from service.running import dispatch
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
+from tests.service.harness import until
 
 # Apprise looks for a module that Python 3.13 no longer has.
 pytestmark = pytest.mark.filterwarnings("ignore:'imghdr' is deprecated:DeprecationWarning")
@@ -80,14 +80,6 @@ def relay(mailbox: tuple[Mailbox, int]) -> Iterator[str]:
     yield f"http://127.0.0.1:{server.server_port}/notify/operators"
     server.shutdown()
     server.server_close()
-
-
-def until(found: Callable[[], Any]) -> None:
-    for _ in range(400):
-        if found():
-            return
-        time.sleep(0.05)
-    raise AssertionError("it never came true")
 
 
 def test_an_alarm_arrives_as_a_mail_and_waits_for_a_full_mailbox(

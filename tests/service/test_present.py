@@ -160,6 +160,25 @@ def test_a_forecast_from_the_past_says_so(make_client, gate: Path, monkeypatch: 
     assert "2 h before the last sample" in notice and "100 of 7300 samples" in notice
 
 
+def test_before_there_is_a_state_the_answer_asks_for_another_try(
+    make_client, gate: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client = make_client(workbench=Gated)
+    client.post("/v1/twins", json=SPEC)
+    monkeypatch.setattr("service.live.forecasts.SETTLE_S", 0.1)
+    monkeypatch.setattr("service.live.forecasts.FIRST_S", 0.1)
+    refused = client.get(f"{TWIN}/forecast?horizon_s=60")
+    assert (refused.status_code, "Retry-After" in refused.headers) == (409, False)
+    send(client, 0, 100)
+    calibrate(client)
+    early = client.get(f"{TWIN}/forecast?horizon_s=60")
+    assert (early.status_code, "Retry-After" in early.headers) == (409, True)
+    assert "still being assimilated" in early.json()["detail"]
+    gate.touch()
+    monkeypatch.setattr("service.live.forecasts.SETTLE_S", 60.0)
+    assert forecast(client)["from"] == iso(99)
+
+
 def test_a_service_that_starts_behind_a_long_archive_knows_the_present_at_once(make_client, gate: Path) -> None:
     deaf = make_client(workbench=Gated, assimilate=False)
     deaf.post("/v1/twins", json=SPEC)

@@ -1,7 +1,6 @@
 """A specification changes: the archive and the models stay, and the service says which of them still hold."""
 
 import json
-import time
 from typing import Any
 
 import pytest
@@ -9,7 +8,7 @@ import yaml
 
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
-from tests.service.harness import AppClient
+from tests.service.harness import AppClient, until
 from tests.service.test_years import TWIN, calibrate, ingest
 
 GROWN: dict[str, Any] = {
@@ -80,11 +79,7 @@ def test_new_limits_raise_alarms_and_every_model_holds(make_client: Any) -> None
     assert put(client, limited).json()["models"][0]["holds"]
     assert client.get(f"{TWIN}/residuals").json()["samples"] == samples
     ingest(client, 600, 10)
-    for _ in range(100):
-        if client.get(f"{TWIN}/alarms").json()["alarms"]:
-            break
-        time.sleep(0.05)
-    assert client.get(f"{TWIN}/alarms").json()["alarms"][0]["channel"] == "T_px"
+    assert until(lambda: client.get(f"{TWIN}/alarms").json()["alarms"])[0]["channel"] == "T_px"
 
 
 @pytest.mark.parametrize(

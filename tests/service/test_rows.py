@@ -2,7 +2,6 @@
 
 import json
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import yaml
 
 from tests.service.conftest import SPEC, MakeClient
 from tests.service.fakes import FakeWorkbench
-from tests.service.harness import AppClient
+from tests.service.harness import AppClient, until
 
 GRAFANA = Path(__file__).parents[2] / "replay" / "bridges" / "grafana"
 BEGUN_S = 1_772_323_200
@@ -33,18 +32,10 @@ def client(make_client: MakeClient) -> AppClient:
     columns = {"time": [BEGUN_S + 60 * k for k in ks], "values": values}
     assert client.post("/v1/twins/benchsat/telemetry", json=columns).status_code == 200
     job = client.post("/v1/twins/benchsat/calibrations", json={}).json()
-    wait(lambda: client.get(f"/v1/twins/benchsat/calibrations/{job['id']}").json()["state"] == "succeeded")
-    wait(lambda: client.get("/v1/twins/benchsat/anomalies").json()["anomalies"])
-    wait(lambda: client.get("/v1/twins/benchsat/alarms").json()["alarms"])
+    until(lambda: client.get(f"/v1/twins/benchsat/calibrations/{job['id']}").json()["state"] == "succeeded")
+    until(lambda: client.get("/v1/twins/benchsat/anomalies").json()["anomalies"])
+    until(lambda: client.get("/v1/twins/benchsat/alarms").json()["alarms"])
     return client
-
-
-def wait(condition: Any) -> None:
-    for _ in range(600):
-        if condition():
-            return
-        time.sleep(0.05)
-    raise AssertionError("never so")
 
 
 def rows(client: AppClient, what: str, **query: Any) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ from service.jobs.schedule import LONGEST_BACK_OFF_S, Watch
 from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
+from tests.service.harness import until
 
 TWIN = "/v1/twins/benchsat"
 
@@ -53,11 +54,12 @@ def test_a_running_service_recalibrates_by_itself(make_client, settings: dict) -
     while client.get(path).json()["state"] in ("queued", "running"):
         time.sleep(0.02)
     send(100, 50.0)
-    for _ in range(300):
+
+    def by_itself() -> bool:
         jobs = client.get(f"{TWIN}/calibrations").json()["jobs"]
-        if len(jobs) > 1 and jobs[0]["state"] == "succeeded":
-            break
-        time.sleep(0.05)
+        return len(jobs) > 1 and jobs[0]["state"] == "succeeded"
+
+    until(by_itself)
     newest = client.get(f"{TWIN}/models").json()["models"][-1]
     assert newest["provenance"]["settings"]["trigger"] == ("schedule" if "calibrate_every_s" in settings else "anomaly")
 
@@ -86,8 +88,6 @@ def test_a_refuted_model_is_diagnosed_once(make_client) -> None:
     values = {"T_px": [0.0] * 60, "T_tank": [0.0] * 60, "Q_px": [0.5] * 60}
     client.post(f"{TWIN}/telemetry", json={"time": list(range(60)), "values": values})
     client.post(f"{TWIN}/calibrations", json={"activate": True})
-    deadline = time.monotonic() + 30.0
-    while not client.get(f"{TWIN}/diagnoses").json()["jobs"] and time.monotonic() < deadline:
-        time.sleep(0.05)
+    until(lambda: client.get(f"{TWIN}/diagnoses").json()["jobs"])
     time.sleep(2.5)  # two more looks of the schedule
     assert [job["kind"] for job in client.get(f"{TWIN}/diagnoses").json()["jobs"]] == ["diagnosis"]

@@ -62,19 +62,19 @@ INDICES = {
 @pytest.mark.parametrize("index", INDICES.values(), ids=list(INDICES))
 def test_a_frame_becomes_a_record_and_a_frame_again(spec: tt.TwinSpec, index: Any) -> None:
     given = frame(index)
-    record = tt.from_dataframe(given, spec)
+    record = tt.Record.from_dataframe(given, spec)
     assert record.present(0.0) == "2026-03-01T00:00:00Z"
     assert record.values["T_cup"].mean() == pytest.approx(given["T_cup"].mean() + 273.15)
     assert record.values["T_wall"][0] == pytest.approx(WALL_C + 273.15)
     assert any("comment" in notice for notice in record.notices)
-    back = tt.to_dataframe(record, spec)
+    back = record.to_dataframe()
     assert (back.index == INDICES["naive"].tz_localize("UTC")).all()
     np.testing.assert_allclose(back["T_cup"], given["T_cup"])
 
 
 def test_rows_out_of_order_are_the_same_record(spec: tt.TwinSpec) -> None:
     given = frame(INDICES["zone"])
-    record, shuffled = (tt.from_dataframe(f, spec) for f in (given, given.sample(frac=1.0, random_state=0)))
+    record, shuffled = (tt.Record.from_dataframe(f, spec) for f in (given, given.sample(frac=1.0, random_state=0)))
     assert shuffled.epoch_ns == record.epoch_ns
     np.testing.assert_array_equal(shuffled.time_s, record.time_s)
     np.testing.assert_array_equal(shuffled.values["T_cup"], record.values["T_cup"])
@@ -82,28 +82,39 @@ def test_rows_out_of_order_are_the_same_record(spec: tt.TwinSpec) -> None:
 
 def test_an_index_of_words_is_refused_in_one_line(spec: tt.TwinSpec) -> None:
     with pytest.raises(tt.TwinError, match=r"^[^\n]+neither instants nor seconds[^\n]+$"):
-        tt.from_dataframe(frame([f"sample {i}" for i in range(400)]), spec)
+        tt.Record.from_dataframe(frame([f"sample {i}" for i in range(400)]), spec)
 
 
 def test_seconds_stay_seconds(spec: tt.TwinSpec) -> None:
     by_column = frame().rename_axis("time_s").reset_index()
     for given in (frame(), by_column, frame(pd.to_timedelta(frame().index, unit="s"))):
-        record = tt.from_dataframe(given, spec)
+        record = tt.Record.from_dataframe(given, spec)
         assert record.epoch_ns is None and record.time_s[1] == 30.0
     assert "400 samples" in repr(record) and len(repr(record)) < 200
 
 
+def test_a_part_of_a_record_and_one_that_was_read_know_their_units(spec: tt.TwinSpec, tmp_path: Path) -> None:
+    path = tmp_path / "cup.csv"
+    frame(INDICES["zone"]).drop(columns="comment").to_csv(path, index_label="time")
+    record = tt.read(path, spec)
+    assert isinstance(record, tt.Record)
+    part = record.between(3000.0, 6000.0).to_dataframe()
+    assert part.shape == (100, 3)
+    np.testing.assert_allclose(part["T_wall"], WALL_C + 273.15)
+    np.testing.assert_allclose(part["T_cup"], frame()["T_cup"].to_numpy()[100:200])
+
+
 def test_what_is_wrong_is_one_line(spec: tt.TwinSpec) -> None:
     with pytest.raises(tt.TwinError, match="channel 'Q' is missing"):
-        tt.from_dataframe(frame().drop(columns="Q"), spec)
+        tt.Record.from_dataframe(frame().drop(columns="Q"), spec)
     with pytest.raises(tt.TwinError, match="'T_cup' holds what is no number"):
-        tt.from_dataframe(frame().assign(T_cup="warm"), spec)
+        tt.Record.from_dataframe(frame().assign(T_cup="warm"), spec)
     with pytest.raises(tt.TwinError, match="neither instants nor seconds"):
-        tt.from_dataframe(frame([f"row {i}" for i in range(400)]), spec)
+        tt.Record.from_dataframe(frame([f"row {i}" for i in range(400)]), spec)
 
 
 def test_the_whole_way(spec: tt.TwinSpec, tmp_path: Path) -> None:
-    record = tt.from_dataframe(frame(INDICES["naive"]), spec)
+    record = tt.Record.from_dataframe(frame(INDICES["naive"]), spec)
     model = tt.calibrate(spec, record)
     assert model.values["G:cup|wall"] == pytest.approx(CONDUCTANCE, rel=0.01)
     assert model.values["C:cup"] == pytest.approx(CAPACITY, rel=0.01)

@@ -88,7 +88,8 @@ def _by_neural_ode(
         if error.name not in ("torch", "torchdiffeq"):
             raise
         raise ModelError(
-            f"method 'neural-ode' needs {error.name}, which is not installed: pip install 'thermal-twin[neural]'"
+            f"method 'neural-ode' needs {error.name}, which is not installed: pip install torch torchdiffeq "
+            "(README: how to get the small build)"
         ) from error
     from twin_core.calibrate.second_order import to_model
 

@@ -207,23 +207,23 @@ def correlate(
         stated, held = by_sensitivity(stated, records, most_free)
     calibration = fit_trajectories(stated, records, loss=loss, deadline=deadline, progress=progress)
     model = explained(to_model(calibration, ()), calibration, deadline=deadline)
-    declared = _as_declared(calibration.problem)
-    tables = {"before": declared, "after": list(calibration.optimum.fit.predicted_K)}
-    measured = [segment.measured_K for segment in calibration.problem.segments]
-    scores = {when: with_met(spec, score(spec.sensors, measured, t)) for when, t in tables.items()}
+    read_K = {"before": _as_declared(calibration.problem), "after": list(calibration.optimum.fit.predicted_K)}
+    measured_K = [segment.measured_K for segment in calibration.problem.segments]
+    of_phases = [
+        (phase, measured_K[i], {when: table[i] for when, table in read_K.items()}) for i, phase in enumerate(phases)
+    ]
     report: Json = {
         "twin": spec.twin,
         "verdict": "correlated",
-        **scores,
-        "criteria": {when: acceptance(spec, scores[when]["per_sensor"]) for when in scores},
+        **_over_all(spec, measured_K, read_K),
         "phases": [
             {
                 "phase": phase.name,
                 "steady": phase.steady,
-                "samples": int(np.isfinite(measured[i]).any(axis=1).sum()),
-                **{when: _of_phase(spec, phase, measured[i], tables[when][i]) for when in tables},
+                "samples": int(np.isfinite(measured).any(axis=1).sum()),
+                **{when: _of_phase(spec, phase, measured, predicted) for when, predicted in tables.items()},
             }
-            for i, phase in enumerate(phases)
+            for phase, measured, tables in of_phases
         ],
         "parameters": _rows(model, calibration),
         "correlations": model.summary["correlations"],
@@ -231,11 +231,15 @@ def correlate(
         "notices": [*_told_held(held), *model.summary["notices"]],
     }
     plots = {
-        phase.name: _series(spec, phase, measured[i], {when: tables[when][i] for when in tables})
-        for i, phase in enumerate(phases)
-        if not phase.steady
+        phase.name: _series(spec, phase, measured, tables) for phase, measured, tables in of_phases if not phase.steady
     }
     return Correlation(model, calibration, report, plots)
+
+
+def _over_all(spec: TwinSpec, measured_K: Sequence[FloatArray], read_K: Mapping[str, Sequence[FloatArray]]) -> Json:
+    """Return scores over all phases, before and after, and whether they meet the criteria."""
+    scores = {when: with_met(spec, score(spec.sensors, measured_K, tables)) for when, tables in read_K.items()}
+    return {**scores, "criteria": {when: acceptance(spec, row["per_sensor"]) for when, row in scores.items()}}
 
 
 def _told_held(names: Sequence[str]) -> list[str]:

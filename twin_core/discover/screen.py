@@ -21,8 +21,9 @@ from twin_core.network.terms import Along
 from twin_core.simulate.response import heat_response
 from twin_core.simulate.stages import balance_along
 
-COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 1.6e7
-"""Responses held at once: so many columns, and so many numbers (130 MB): a long record is gone through in portions."""
+COLUMNS_AT_ONCE, VALUES_AT_ONCE = 256, 2e6
+"""Responses held at once: so many columns, and so many numbers (16 MB, of which some copies exist meanwhile): a long record is
+gone through in portions."""
 
 UNSEEN_SHARE = 1e-4
 """A candidate whose response is this close to what the nuisance parameters can mimic is not told by the data."""
@@ -150,7 +151,7 @@ def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
         whiten(fit.problem, fit.undeclared, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
         for nominal, block in zip(fit.nominals, blocks, strict=True)
     ]
-    return np.concatenate(parts)
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
@@ -211,8 +212,7 @@ def screen_sizes(
     for effects, edges, blocks in _portions(fit, survey, candidates):
         n_tried += len(effects)
         for found, (one, basis, residual) in zip(probes, grounds, strict=True):
-            whitened = _whitened(one, blocks)
-            found += _probes(effects, edges, whitened, basis[: whitened.shape[0]], residual[: whitened.shape[0]])
+            found += _probes(effects, edges, _whitened(one, blocks), basis, residual)
     return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
 
 
@@ -260,15 +260,21 @@ def _probes(
     """Return the probes of candidates that the data tell and whose best amplitudes are physical.
 
     ``edges`` are where the columns of each begin and end in the responses ``whitened`` (n_rows, n_columns). ``basis``
-    (n_rows, n_basis) is orthonormal and off it ``residual`` (n_rows,) is projected: P'P = W'W - (B'W)'(B'W) and P'r = W'r of the
-    projected responses P, which need not be formed. Candidates with equally many amplitudes go through the algebra at once.
+    (n_rows + n_free, n_basis) is orthonormal, off it ``residual`` (n_rows + n_free,) is projected: P'P = W'W - (B'W)'(B'W) and
+    P'r = W'r of the projected responses P, which need not be formed. Candidates with equally many amplitudes go through the
+    algebra at once; those whose responses are no numbers are left out.
     """
-    along, inside, columns = residual @ whitened, basis.T @ whitened, np.ascontiguousarray(whitened.T)
+    n_rows = whitened.shape[0]
+    along, inside = residual[:n_rows] @ whitened, basis[:n_rows].T @ whitened
+    columns = np.ascontiguousarray(whitened.T)
+    sane = np.isfinite(along)
     n_amplitudes = np.diff(edges)
     found: list[Probe] = []
     for k in np.unique(n_amplitudes).tolist():
+        at = np.asarray(edges)[:-1, None] + np.arange(k)
         which = np.flatnonzero(n_amplitudes == k)
-        at = np.asarray(edges)[which, None] + np.arange(k)
+        which = which[sane[at[which]].all(axis=1)]
+        at = at[which]
         own, mimicked = columns[at], inside.T[at]
         squares = own @ own.transpose(0, 2, 1)
         products = squares - mimicked @ mimicked.transpose(0, 2, 1)

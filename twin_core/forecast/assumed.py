@@ -85,9 +85,13 @@ class Assumed:
         for name, rule in varying.items():
             if rule.period_s is not None:
                 periods.setdefault(f"{rule.period_s:.6g}", []).append(name)
-        parts = [f"{', '.join(names)} repeat their last {s} s" for s, names in periods.items()]
+        parts = [
+            f"{', '.join(names)} {'repeat their' if len(names) > 1 else 'repeats its'} last {s} s"
+            for s, names in periods.items()
+        ]
         held = [name for name, rule in varying.items() if rule.period_s is None]
-        parts += [f"{', '.join(held)} hold their last value"] if held else []
+        does = "hold their last values" if len(held) > 1 else "holds its last value"
+        parts += [f"{', '.join(held)} {does}"] if held else []
         return (f"no plan was given: {'; '.join(parts)}; the bands contain what that missed before",) if parts else ()
 
 

@@ -1,6 +1,6 @@
 """A network of another tool as it is read, node by node and coupling by coupling, and its specification."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from twin_core._typing import Json
@@ -98,17 +98,37 @@ def specified(
     for node in channels:
         if node not in deck.capacities:
             raise SpecError(f"{source}: has no node '{node}' that a sensor could read")
-    notes = list(deck.notes)
-    read = dict(channels)
-    if not read:
-        read = {node: f"T_{node}" for node, capacity in deck.capacities.items() if capacity > 0.0}
-        notes.append(f"{source}: every node got a channel 'T_<node>'; name those that telemetry reads with --channel")
-    if deck.parallel:
-        notes.append(f"{source}: {deck.parallel} couplings lie parallel to others and were added to them")
-    dropped = [f"{a} - {b}" for c in (deck.linear, deck.radiative) for (a, b), v in c.items() if 0.0 <= v < SMALLEST]
-    if dropped:
-        notes.append(f"{source}: {len(dropped)} couplings are below {SMALLEST:g} and left out ({dropped[0]}, ...)")
-    key = "value" if held else "guess"
+    read = channels or {node: f"T_{node}" for node, capacity in deck.capacities.items() if capacity > 0.0}
+    driven = {name: nodes for name, nodes in deck.driven.items() if nodes}
+    derived, loads = _loads(deck)
+    document: Json = {
+        "twin": deck.name,
+        "boundaries": {name: {"value_K": number(value)} for name, value in deck.boundaries.items()},
+        "channels": {column: {"kind": "temperature", "unit": "degC"} for column in read.values()}
+        | {name: {"kind": "power", "unit": "W", "interpolation": "linear"} for name in driven},
+        "derived": derived,
+        "nodes": [
+            {"id": node, "capacity_J_per_K": {"value": number(capacity)}}
+            | ({"sensor": read[node]} if node in read else {})
+            for node, capacity in deck.capacities.items()
+        ],
+        **_couplings(deck, held, by_submodel),
+        "loads": loads
+        + [
+            {"channel": name, "node": node, "gain": {"value": number(gain)}}
+            for name, nodes in driven.items()
+            for node, gain in nodes.items()
+            if node in deck.capacities
+        ],
+    }
+    courses = {name: deck.courses[name] for name in driven}
+    notes = (*deck.notes, *_told(deck, not channels, list(driven), source))
+    return Imported({k: v for k, v in document.items() if v}, notes, tuple(deck.refused), dict(deck.start_K), courses)
+
+
+def _couplings(deck: Deck, held: bool, by_submodel: bool) -> Json:
+    """Return the document's conductors and radiation, and the parameters that scale them."""
+    key, outer = "value" if held else "guess", set(deck.boundaries)
     factors: dict[str, Json] = {}
 
     def size(pair: tuple[str, str], kind: str, value: float) -> Json:
@@ -118,46 +138,38 @@ def specified(
         factors[factor] = {"guess": 1.0}
         return {"value": number(value), "scale": factor}
 
-    def couplings(table: Mapping[tuple[str, str], float], kind: str, what: str) -> list[Json]:
-        outer = set(deck.boundaries)
+    def rows(table: Mapping[tuple[str, str], float], kind: str, what: str) -> list[Json]:
         return [
             {"between": list(pair), what: size(pair, kind, value)}
             for pair, value in table.items()
             if value >= SMALLEST and not set(pair) <= outer
         ]
 
-    document: Json = {"twin": deck.name}
-    document["boundaries"] = {name: {"value_K": number(value)} for name, value in deck.boundaries.items()}
-    document["channels"] = {column: {"kind": "temperature", "unit": "degC"} for column in read.values()}
-    driven = {name: nodes for name, nodes in deck.driven.items() if nodes}
-    document["channels"] |= {name: {"kind": "power", "unit": "W", "interpolation": "linear"} for name in driven}
+    one_way = rows(deck.one_way, "GL", "conductance_W_per_K")
+    return {
+        "conductors": rows(deck.linear, "GL", "conductance_W_per_K")
+        + [{**row, "into": row["between"][1]} for row in one_way],
+        "radiation": rows(deck.radiative, "GR", "area_m2"),
+        "parameters": factors,
+    }
+
+
+def _told(deck: Deck, unread: bool, driven: Sequence[str], source: str) -> list[str]:
+    """Return what to say of channels that were made up, and of couplings that were added up or left out."""
+    notes = []
+    if unread:
+        notes.append(f"{source}: every node got a channel 'T_<node>'; name those that telemetry reads with --channel")
+    if deck.parallel:
+        notes.append(f"{source}: {deck.parallel} couplings lie parallel to others and were added to them")
+    dropped = [f"{a} - {b}" for c in (deck.linear, deck.radiative) for (a, b), v in c.items() if 0.0 <= v < SMALLEST]
+    if dropped:
+        notes.append(f"{source}: {len(dropped)} couplings are below {SMALLEST:g} and left out ({dropped[0]}, ...)")
     if driven:
         notes.append(
             f"{source}: {len(driven)} heat(s) go over time and became channels that telemetry must carry "
-            f"({next(iter(driven))}, ...)"
+            f"({driven[0]}, ...)"
         )
-    derived, loads = _loads(deck)
-    loads += [
-        {"channel": name, "node": node, "gain": {"value": number(gain)}}
-        for name, nodes in driven.items()
-        for node, gain in nodes.items()
-        if node in deck.capacities
-    ]
-    document["derived"] = derived
-    document["nodes"] = [
-        {"id": node, "capacity_J_per_K": {"value": number(capacity)}} | ({"sensor": read[node]} if node in read else {})
-        for node, capacity in deck.capacities.items()
-    ]
-    one_way = couplings(deck.one_way, "GL", "conductance_W_per_K")
-    document["conductors"] = couplings(deck.linear, "GL", "conductance_W_per_K") + [
-        {**entry, "into": entry["between"][1]} for entry in one_way
-    ]
-    document["radiation"] = couplings(deck.radiative, "GR", "area_m2")
-    document["loads"] = loads
-    document["parameters"] = factors
-    whole = {k: v for k, v in document.items() if v}
-    courses = {name: deck.courses[name] for name in driven}
-    return Imported(whole, tuple(notes), tuple(deck.refused), dict(deck.start_K), courses)
+    return notes
 
 
 def _loads(deck: Deck) -> tuple[Json, list[Json]]:

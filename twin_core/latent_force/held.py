@@ -153,7 +153,7 @@ class HeldForce:
                 np.ascontiguousarray(np.nan_to_num(columns[:, :, first : first + COLUMNS_AT_ONCE])),
             )
             parts.append(whitened)
-        return np.concatenate(parts, axis=2), log_det
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2), log_det
 
     def linear_model(self, drift_K: FloatArray, prior_mean_K: FloatArray) -> LinearModel:
         """Return the same model for filter and smoother, with b (n_steps, n_nodes) and a mean of the start (n_nodes,)."""

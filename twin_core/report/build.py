@@ -18,6 +18,9 @@ from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out,
 from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
 
+MOST_REJECTED = 8
+"""Rows of what was tried and not supported."""
+
 
 def where_json(effect: Effect) -> Json:
     """Return the place of an effect with the contract's keys; a pair is a list."""
@@ -206,56 +209,32 @@ def build_report(
     moments
         Of the training telemetry, at which heat flows are told.
     """
-    sensors = before.spec.sensors
-    scores = [with_met(before.spec, held_out_scores(sensors, p)) for p in predictions]
+    scores = [with_met(before.spec, held_out_scores(before.spec.sensors, p)) for p in predictions]
     train = [segment.record for segment in search.base.fit.problem.segments]
-    residuals = [[p.measured_K - p.predicted_K for p in ps] for ps in predictions]
-    scored = [h.scored for h in held]
-    failures = search.failures
     counted = int(sum(np.isfinite(p.measured_K).any(axis=1).sum() for p in predictions[0]))
+    failures = search.failures
+    flows = attempted(lambda: heat_flow_maps(search, after, moments), "heat flows", failures) or []
+    moved = attempted(lambda: sensitivity(search.trial.calibration()), "sensitivity matrix", failures) or {}
     return {
         "twin": before.spec.twin,
         "verdict": verdict,
         "train": span_json(train, before.summary["train"]["samples"]),
-        "holdout": span_json(scored, counted),
+        "holdout": span_json([h.scored for h in held], counted),
         "before": scores[0],
         "findings": findings_json(search.findings, after),
         "after": scores[1],
         "noise_floor_K": noise_floor_K(before),
-        "residual_whiteness": {
-            "before": residual_whiteness(residuals[0]),
-            "after": residual_whiteness(residuals[1]),
-        },
-        "criteria": {
-            "before": acceptance(before.spec, scores[0]["per_sensor"]),
-            "after": acceptance(after.spec, scores[1]["per_sensor"]),
-        },
-        "ensemble": {
-            when: ensemble(before.spec, row_of["per_sensor"], p)
-            for when, row_of, p in zip(("before", "after"), scores, predictions, strict=True)
-        },
+        **_of_holdout((before, after), scores, predictions),
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
-        "not_supported": [
-            {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged), "reason": judged.reason}
-            for judged in best_rejected(search)[:8]
-        ],
-        "unexplained_share": {
-            "before": unexplained_share(search.base.calibration()),
-            "after": unexplained_share(search.trial.calibration()),
-        },
+        **_of_search(search),
         "parameters": parameter_rows(search, before, after),
         "correlations": strong_correlations(after.network().parameters, after.covariance, 0.5, 15)
         if after.free_names
         else [],
-        "sensitivity": attempted(lambda: sensitivity(search.trial.calibration()), "sensitivity matrix", failures) or {},
-        "heat_flows": attempted(lambda: heat_flow_maps(search, after, moments), "heat flows", failures) or [],
+        "sensitivity": moved,
+        "heat_flows": flows,
         "excluded": left_out(before.spec),
-        "failures": list(dict.fromkeys(search.failures)),
-        "search": {
-            "complete": not search.left_out,
-            "left_out": len(search.left_out),
-            "every": search.every,
-        },
+        "failures": list(dict.fromkeys(failures)),
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
@@ -264,4 +243,34 @@ def build_report(
             *before.summary["notices"],
             *(notice for p in predictions[1] for notice in p.notices),
         ],
+    }
+
+
+def _of_holdout(
+    models: tuple[CalibratedModel, CalibratedModel],
+    scores: Sequence[Json],
+    predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
+) -> Json:
+    """Return what is told of the predictions over the hold-out beside their errors, before and after."""
+    told: Json = {"residual_whiteness": {}, "criteria": {}, "ensemble": {}}
+    for when, model, scored, predicted in zip(("before", "after"), models, scores, predictions, strict=True):
+        residuals = [p.measured_K - p.predicted_K for p in predicted]
+        told["residual_whiteness"][when] = residual_whiteness(residuals)
+        told["criteria"][when] = acceptance(model.spec, scored["per_sensor"])
+        told["ensemble"][when] = ensemble(model.spec, scored["per_sensor"], predicted)
+    return told
+
+
+def _of_search(search: Search) -> Json:
+    """Return what the search looked at and did not support, and what it left unexplained."""
+    return {
+        "not_supported": [
+            {"effects": [e.label for e in judged.effects], "evidence": evidence_json(judged), "reason": judged.reason}
+            for judged in best_rejected(search)[:MOST_REJECTED]
+        ],
+        "unexplained_share": {
+            "before": unexplained_share(search.base.calibration()),
+            "after": unexplained_share(search.trial.calibration()),
+        },
+        "search": {"complete": not search.left_out, "left_out": len(search.left_out), "every": search.every},
     }

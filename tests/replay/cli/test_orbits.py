@@ -97,7 +97,9 @@ def _look(client: TwinClient, orbits: Orbits) -> None:
     twin = orbits.spec.twin
     job = client.wait(twin, client.calibrate(twin))
     assert job.state == "succeeded", job.message
-    residuals = client.residuals(twin)
+    deadline_s = time.monotonic() + 120.0
+    while (residuals := client.residuals(twin)).samples < orbits.record.time_s.size:
+        assert time.monotonic() < deadline_s, f"{residuals.samples} residuals"
     for name in orbits.spec.sensors:
         later = np.array(residuals.residual_K[name][60:], dtype=float)
         assert np.sqrt(np.mean(later**2)) < 0.16  # twice the sensors' noise

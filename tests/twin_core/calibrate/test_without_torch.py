@@ -18,5 +18,5 @@ def test_a_missing_extra_is_named(missing: str, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setitem(sys.modules, missing, None)
     time_s = np.arange(0.0, 600.0, 10.0)
     record = record_of(time_s, T0=290.0 + time_s / 100.0, T1=280.0)
-    with pytest.raises(ModelError, match=rf"needs {missing}.*thermal-twin\[neural\]"):
+    with pytest.raises(ModelError, match=rf"needs {missing}, .*pip install torch torchdiffeq"):
         calibrate(load_spec(conductive_spec(2, [(0, 1)])), [record], method="neural-ode")

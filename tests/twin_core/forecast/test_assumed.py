@@ -43,7 +43,7 @@ def test_a_periodic_input_goes_on_and_another_holds() -> None:
     past = record_of(time_s, T0=290.0, Q=wave(time_s), P=7.0)
     found = ahead(integrator(Q=POWER, P=POWER), past, 2.0 * PERIOD_S)
     assert found.inputs == {"Q": "repeat", "P": "hold"}
-    assert any("Q repeat their last 5400" in notice and "P" not in notice.split(":")[1] for notice in found.notices)
+    assert any("Q repeats its last 5400" in notice and "P" not in notice.split(":")[1] for notice in found.notices)
     now_s = time_s[-1]
     fine = now_s + np.arange(0.5, 2.0 * PERIOD_S)
     heat_J = np.cumsum(wave(fine) + 7.0)[np.rint(found.time_s - now_s).astype(int) - 1]

@@ -14,7 +14,7 @@ from twin_core.errors import SpecError
 from twin_core.units import calendar_instant, parse_instant_ns
 
 CAPACITY_J_PER_K = 1000.0
-"""Makes a heat in W the same number as a rate in K/ks."""
+"""Capacity of a node, in J/K: 1 W into 1000 J/K is 1 K/ks, Xija's unit of a heat, so that its numbers stay."""
 
 FIRST_METHOD, FIRST_METHOD_MORE = 1.5, 0.625
 """Xija's first way to integrate (``evolve_method`` 1, and models that name none) goes on from the middle of a step by a whole

@@ -7,7 +7,7 @@ from twin_core.interchange.xija.components import INSTRUMENTS, Component, instan
 from twin_core.interchange.xija.draft import Draft, UnknownError
 
 YEAR_DAYS = 365.3
-"""Xija's year, a tenth of 2000 to 2010."""
+"""Xija's year in days: a tenth of the 3,653 from 2000 to 2010. Source: ``SolarHeat.t_phase`` in xija/component/heat/solar.py."""
 
 _POSITIONS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "all": (
@@ -19,9 +19,12 @@ _POSITIONS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "hrc-is": (("hrcs", -400000.0, -85000.0), ("hrci", -85000.0, 0.0), ("acis", 0.0, 400000.0)),
     "acis-is": (("acisi", -400000.0, 0.0), ("aciss", 0.0, 83000.0), ("hrc", 83000.0, 400000.0)),
 }
-"""Positions of the instrument table for each family of solar heat: name, above, up to."""
+"""Positions of the instrument table for each family of solar heat: name, above, up to, in steps of its motor. Source: classes of
+that family in xija/component/heat/solar.py."""
 
-HRC_S = -86147.0
+HRC_S_STEPS = -86147.0
+"""Up to this position of the instrument table, in steps of its motor, HRC-S is in the focal plane, from there to 0 HRC-I. Source:
+``SolarHeatHrcOpts.dvals_post_hook`` in xija/component/heat/solar.py."""
 
 
 def solar(write: Draft, component: Component) -> None:
@@ -54,8 +57,8 @@ def solar(write: Draft, component: Component) -> None:
         sim_z = write.channel(str(args.get("simz_comp") or "sim_z"), levels=True)
         for par, where in (
             ("hrc_bias", f"{sim_z} < 0.0"),
-            ("hrci_bias", f"({sim_z} < 0.0) * ({sim_z} > {HRC_S})"),
-            ("hrcs_bias", f"{sim_z} <= {HRC_S}"),
+            ("hrci_bias", f"({sim_z} < 0.0) * ({sim_z} > {HRC_S_STEPS})"),
+            ("hrcs_bias", f"{sim_z} <= {HRC_S_STEPS}"),
         ):
             write.power(component, node, component.par(par), where, par)
 

@@ -23,7 +23,8 @@ from twin_core.interchange.xija.draft import FITTED_SPREAD, Draft, UnknownError
 from twin_core.interchange.xija.solar import off_nominal_roll, solar, solar_by_instrument
 
 SWITCHING_BAND_K = 0.1
-"""Width over which a thermostat without a deadband switches: at its set-point it would switch at every instant."""
+"""Width in K over which a thermostat without a deadband goes from all to nothing, for at its set-point it would switch at every
+instant. Chosen: a small part of the 1 to 3 K by which flown models miss their telemetry."""
 
 _POWER_STATES = ("0xxx", "1xxx", "2xxx", "3xx0", "3xx1", "4xxx", "5xxx", "66x0", "6611", "6xxx")
 
