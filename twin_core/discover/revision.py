@@ -126,14 +126,23 @@ def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float)
 
 
 def prune(state: Search, needed: float) -> None:
-    """Drop findings, and members of a set that was found together, that the others have made superfluous."""
+    """Drop findings, and members of a set that was found together, that the others have made superfluous.
+
+    Beside the others each must be supported by the odds asked for, and explain at one sensor at least what the search would
+    look for.
+    """
     for finding in list(state.findings):
-        for effect in finding.effects if len(finding.effects) > 1 or finding is not state.findings[-1] else ():
+        for effect in finding.effects:
             if all(other.place == effect.place for other in state.trial.effects):
                 continue
             kept = _attempted_without(state, {effect.place})
-            if kept is not None and kept[1] <= needed:
+            if kept is not None and (kept[1] <= needed or _explains_nothing(kept[0], state.trial)):
                 _drop(state, {effect.place}, *kept)
+
+
+def _explains_nothing(without: Trial, trial: Trial) -> bool:
+    """Return whether a trial has no sensor that leaves less than without an effect by what counts as missing."""
+    return bool((without.excess() - trial.excess()).max() < policy.LEAST_EXCESS)
 
 
 def reconsider(state: Search, needed: float) -> None:
@@ -183,8 +192,25 @@ def tell_alternatives(state: Search, needed: float) -> None:
         )
         if compared is not None:
             state.findings[i] = compared
-            told = {e.place for option in compared.alternatives for e in option.effects}
+            _lead_with_the_likeliest(state, i, needed)
+            told = {e.place for option in state.findings[i].alternatives for e in option.effects}
             state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in told)]
+
+
+def _lead_with_the_likeliest(state: Search, position: int, needed: float) -> None:
+    """Exchange a finding for that of its alternatives which is likelier by the odds asked for and passes, if there is one.
+
+    The first look ranks by linear responses: what it left out may turn out to explain more. The finding is an alternative then.
+    """
+    finding = state.findings[position]
+    best = min(finding.alternatives, key=worth, default=finding.judged)
+    if worth(best) >= worth(finding.judged) - needed:
+        return
+    replaced = partial(_in_place_of, state, finding, best, needed)
+    if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
+        others = [option for option in finding.alternatives if option is not best]
+        alternatives = tuple(sorted((finding.judged, *others), key=worth))
+        state.findings[position] = replace(state.findings[position], alternatives=alternatives)
 
 
 def _attempted_without(state: Search, places: Collection[object]) -> tuple[Trial, float] | None:

@@ -39,12 +39,13 @@ from twin_core.discover.policy import (
     DOMINANCE,
     FORESIGHT,
     LEAST_COARSENESS,
+    LEAST_EXCESS,
     MOST_COARSENESS,
     REPEATABLE_SHARE,
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.revision import exchange, reconsider, withdraw
+from twin_core.discover.revision import exchange, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -283,6 +284,39 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
+@pytest.mark.parametrize(
+    ("nats", "explains", "kept"),
+    [
+        (NEEDED + JUST, LEAST_EXCESS + JUST, ["a", "b"]),
+        (NEEDED, 9.0, ["a"]),
+        (90.0, LEAST_EXCESS - JUST, ["a"]),
+    ],
+    ids=["enough", "hardly supported", "next to nothing"],
+)
+def test_beside_the_others_each_must_be_supported_and_explain_something(
+    monkeypatch: pytest.MonkeyPatch, nats: float, explains: float, kept: list[str]
+) -> None:
+    """The search would not look for less: it is no finding because it came with another."""
+    own = {"a": 9.0, "b": 0.5 * explains}  # at one sensor of two twice as much as in the mean
+    support = {"a": 90.0, "b": nats}
+
+    def refitted(effects: Sequence[Effect]) -> Trial:
+        names = {str(e.where["node"]) for e in effects}
+        return stub(*effects, left=sum(value for name, value in own.items() if name not in names))
+
+    def weighed(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+        (lost,) = {str(e.where["node"]) for e in rich.effects} - {str(e.where["node"]) for e in simple.effects}
+        return Evidence(support[lost], 0.0)
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
+    monkeypatch.setattr(revision, "weigh", weighed)
+    pair = refitted((load("a"), load("b")))
+    state = Search(pair, refitted(()), findings=[Finding(Judged(pair.effects, Evidence(99.0, 0.0), pair))])
+    prune(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == kept
+    assert [e.where["node"] for e in state.trial.effects] == kept
+
+
 def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """As an ablation sets them."""
     monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
@@ -513,6 +547,38 @@ def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
     assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
     assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
     assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
+
+
+@pytest.mark.parametrize(
+    ("nats", "alone", "reason", "leads"),
+    [
+        (60.0 + NEEDED + JUST, 60.0 + NEEDED + JUST, "", "boundary_mix"),
+        (60.0 + NEEDED, 99.0, "", "constant_heat_load"),
+        (90.0, 60.0 + NEEDED, "", "constant_heat_load"),
+        (90.0, 99.0, NO_FORESIGHT, "constant_heat_load"),
+    ],
+    ids=["likelier", "hardly likelier", "refitted hardly likelier", "predicts no better"],
+)
+def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
+    monkeypatch: pytest.MonkeyPatch, nats: float, alone: float, reason: str, leads: str
+) -> None:
+    """The finding that it takes the place of is among its alternatives then, and not refused."""
+    found, other = judged("a", 60.0), judged("b", 10.0)
+    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {})
+    option = Judged((mix,), Evidence(nats, 0.0), stub(mix))
+    told = Finding(found, (option, other))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 60.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    (finding,) = state.findings
+    assert [e.name for e in finding.effects] == [leads] == [e.name for e in state.trial.effects]
+    names = [a.effects[0].name for a in finding.alternatives]
+    assert names == (["constant_heat_load"] * 2 if leads == "boundary_mix" else ["boundary_mix", "constant_heat_load"])
+    assert state.rejected == []
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
