@@ -18,6 +18,10 @@ from service.store.segments import MOST_SMALL_CHUNKS, MOST_SMALL_ROWS, SMALL, WI
 STAGED_BYTES = 1900
 """What is larger does not fit a row of PostgreSQL and is written out of line, on its way through a stage twice."""
 
+MOST_STAGED_CHUNKS = 256
+"""Where batches share a commit, small segments are compacted once there are so many: rewriting them costs more than taking them
+in, and to read so many takes a millisecond."""
+
 
 @dataclass(frozen=True)
 class Receipt:
@@ -84,7 +88,7 @@ def _put(stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
         for part in divided(batch.time_us):
             stage.put(segments.segment(twin, seq[part], batch.take(part)))
             head.small_chunks += 1
-    if head.small_chunks >= MOST_SMALL_CHUNKS or head.small_rows >= MOST_SMALL_ROWS:
+    if head.small_chunks >= MOST_STAGED_CHUNKS or head.small_rows >= MOST_SMALL_ROWS:
         stage.compact_later(twin, batch.values.shape[0])
     return Receipt(np.zeros(n, dtype=np.int8), first_seq, last_us)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from service.store import outline
 from service.store.batch import Batch
 from service.store.blobs import instants, matrix
-from service.store.connection import Connection, Row, Stage
+from service.store.connection import Connection, Cursor, Row, Stage
 from service.store.quarters import divided, quarter_of, start_us
 
 SMALL = 512
@@ -41,11 +41,9 @@ _INSERT = """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time,
              VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"""
 
 
-def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> list[int]:
-    """Store samples, a segment for each quarter, and return their sizes; the head of the archive has been moved already."""
-    parts = divided(batch.time_us)
-    make_room(connection, [int(batch.time_us[part].min()) for part in parts])
-    return [_insert(connection, twin, seq[part], batch.take(part)) for part in parts]
+def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
+    """Store samples, a segment for each quarter; the head of the archive has been moved already."""
+    _outline(connection, _insert(connection, twin, seq, batch))
 
 
 def make_room(connection: Connection, instants: Iterable[int]) -> None:
@@ -55,15 +53,27 @@ def make_room(connection: Connection, instants: Iterable[int]) -> None:
         stage.make_room(instants)
 
 
-def _insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> int:
-    has_outline = batch.time_us.size >= outline.PIECE
-    row = connection.execute(
-        _INSERT + " RETURNING id" if has_outline else _INSERT,  # to return it costs a tenth of a small batch
-        segment(twin, seq, batch),
-    )
-    if has_outline:
-        outline.put(connection, "chunk", int(row.fetchone()[0]), batch.time_us, batch.values)
-    return int(batch.time_us.size)
+Stored = list[tuple[Batch, Cursor]]
+"""Segments, and what the database answers to each of them: its id, where an outline needs that."""
+
+
+def _insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> Stored:
+    """Send samples, a segment for each quarter, without waiting for the answers."""
+    parts = divided(batch.time_us)
+    make_room(connection, [int(batch.time_us[part].min()) for part in parts])
+    stored = []
+    for part in parts:
+        held = batch.take(part)
+        query = _INSERT + " RETURNING id" if held.time_us.size >= outline.PIECE else _INSERT  # a tenth of a small batch
+        stored.append((held, connection.execute(query, segment(twin, seq[part], held))))
+    return stored
+
+
+def _outline(connection: Connection, stored: Stored) -> None:
+    """Store the outlines of large segments."""
+    for batch, answer in stored:
+        if batch.time_us.size >= outline.PIECE:
+            outline.put(connection, "chunk", int(answer.fetchone()[0]), batch.time_us, batch.values)
 
 
 def segment(twin: int, seq: NDArray[np.int64], batch: Batch) -> Row:
@@ -120,30 +130,35 @@ def compact(connection: Connection, n_rows: Mapping[int, int]) -> None:
         (SMALL,),
     ).fetchall()
     held: dict[int, list[Row]] = {twin: [] for twin in n_rows}
-    for twin, *row in sorted(gone, key=itemgetter(1)):
-        held[twin].append(tuple(row))
-    counts = []
+    for row in sorted(gone, key=itemgetter(1)):
+        held[row[0]].append(row)
+    counts, stored = [], Stored()
     for twin, rows in held.items():
-        sizes = _rewrite(connection, twin, rows, n_rows[twin]) if rows else []
+        made = _rewrite(connection, twin, rows, n_rows[twin]) if rows else []
+        sizes = [size for batch, _ in made if (size := batch.time_us.size) < SMALL]
         counts.append((len(sizes), sum(sizes), twin))
+        stored += made
+    _outline(connection, stored)
     connection.executemany("UPDATE head SET small_chunks = ?, small_rows = ? WHERE twin = ?", counts)
 
 
-def _rewrite(connection: Connection, twin: int, rows: Sequence[Row], n_rows: int) -> list[int]:
-    """Store what segments (id, seq, time, value, received) of a twin held in as few as may be; return the sizes of small ones."""
-    seq = np.concatenate([instants(row[1]) for row in rows])
-    whole = joined([unpack(n_rows, *row[2:]) for row in rows], n_rows)
+def _rewrite(connection: Connection, twin: int, rows: Sequence[Row], n_rows: int) -> Stored:
+    """Send what segments (twin, id, seq, time, value, received) of a twin held in as few as may be."""
+    _, _, numbers, times, values, arrived = zip(*rows, strict=True)
+    seq, time_us = instants(b"".join(numbers)), instants(b"".join(times))
+    received = [bytes(len(time)) if blob is None else blob for time, blob in zip(times, arrived, strict=True)]
+    held = [matrix(value, n_rows, len(time) // 8) for value, time in zip(values, times, strict=True)]
+    whole = Batch(time_us, np.concatenate(held, axis=1), instants(b"".join(received)))
     steps = np.diff(whole.time_us)
     if (steps < 0).any():
         order = np.argsort(whole.time_us, kind="stable")
         seq, whole = seq[order], Batch(whole.time_us[order], whole.values[:, order], whole.received[order])
         steps = np.diff(whole.time_us)
-    time_us, sizes = whole.time_us, []
+    time_us, stored = whole.time_us, Stored()
     cuts = np.flatnonzero(steps > max(int(time_us[-1] - time_us[0]) // MOST_CUTS, 1)) + 1
     for first, stop in pairwise([0, *cuts.tolist(), time_us.size]):
-        part = whole.take(slice(first, stop))
-        sizes += insert(connection, twin, seq[first:stop], part)
-    return [size for size in sizes if size < SMALL]
+        stored += _insert(connection, twin, seq[first:stop], whole.take(slice(first, stop)))
+    return stored
 
 
 def remove(connection: Connection, segments: Iterable[tuple[int, int]]) -> None:

@@ -118,10 +118,14 @@ class PostgresSession:
 
     def commit(self) -> None:
         """Make it durable."""
-        if self._stage.due:
+        if not self._stage.due:
+            self._stage.flush("COMMIT")
+        else:
+            self._stage.flush()
             self._stage.turn(None)
-            segments.compact(self._speaking, self._stage.due)
-        self._stage.flush("COMMIT")
+            with self._speaking.driver.pipeline():
+                segments.compact(self._speaking, self._stage.due)
+                self._speaking.driver.execute("COMMIT")
         self._stage.end()
 
     def roll_back(self) -> None:

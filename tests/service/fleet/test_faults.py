@@ -48,7 +48,10 @@ def test_a_loss_would_be_noticed(tmp_path: Path, postgres: str) -> None:
     with psycopg.connect(postgres, autocommit=True) as connection:
         copied = "twin, n, first_us, last_us, last_seq, seq, time, value, received"
         connection.execute(f"INSERT INTO chunk ({copied}) SELECT {copied} FROM chunk WHERE twin = 1 LIMIT 1")
-        assert tally(postgres, load, 0.0).twice >= 2
+        assert tally(postgres, load, 0.0).twice >= 4  # two samples, and their numbers
+        query = "SELECT 1, last_seq, 0, 'job', '{}' FROM chunk WHERE twin = 1 LIMIT 1"
+        connection.execute(f"INSERT INTO event (twin, seq, time_us, type, body) {query}")
+        assert tally(postgres, load, 0.0).twice >= 5  # a number of a sample that a message has, too
         connection.execute("DELETE FROM residual WHERE twin = 2")
         connection.execute("UPDATE tenure SET from_us = 0 WHERE epoch = 1")
         connection.execute("INSERT INTO tenure SELECT slot, epoch + 1, 'another', -1 FROM tenure WHERE slot = 5")

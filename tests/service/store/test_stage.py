@@ -93,6 +93,7 @@ def test_a_server_stores_what_a_file_stores(stores: tuple[Database, Database], m
         flush(stage, *after)
 
     monkeypatch.setattr(Stage, "flush", counted)
+    monkeypatch.setattr(appending, "MOST_STAGED_CHUNKS", segments.MOST_SMALL_CHUNKS // 2)
     generator, newest = np.random.default_rng(0), [-1] * TWINS
     for _ in range(ROUNDS):
         orders = a_round(generator, newest)
