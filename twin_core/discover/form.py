@@ -1,7 +1,7 @@
 """The form of a finding: a name stands for a law, so nothing that repeats with temperature may be left where it acts,
 and the declared quantities must be left where they may be."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -34,7 +34,7 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
     float, or None
         Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
-    best, n_tried = _free_forms(trial, effects, needed)
+    best, n_tried = _free_forms(trial, _where(trial, effects), needed)
     tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
     supported = [top for top in _likeliest(trial, tops) if weigh(trial, top, n_tried).log_bayes_factor > most]
     return max((mean_excess(trial) - mean_excess(top) for top in supported), default=None)
@@ -55,10 +55,32 @@ def outdone_by_a_free_form(
     trial, effects, needed, most
         As in :func:`leaves_a_repeatable_heat`, and what is returned as well.
     """
-    best, _ = _free_forms(simple, effects, needed)
+    best, _ = _free_forms(simple, _where(simple, effects), needed)
     instead = [try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS]]
     likelier = [rival for rival in _likeliest(simple, instead) if weigh(rival, trial, 1).log_bayes_factor < -most]
     return max((mean_excess(trial) - mean_excess(rival) for rival in likelier), default=None)
+
+
+def more_is_left_elsewhere(trial: Trial, effects: Sequence[Effect], needed: float) -> bool:
+    """Return whether a free form of temperature on top of named effects is likelier away from where they act than there.
+
+    What repeats with temperature then is no remainder of theirs: something else is missing, or the network is coarse.
+
+    Parameters
+    ----------
+    trial, effects, needed
+        As in :func:`leaves_a_repeatable_heat`.
+    """
+    own = _where(trial, effects)
+    away = _log_bayes_factor(trial, set(trial.fit.network.layout.nodes) - own, needed)
+    return away > needed and away > _log_bayes_factor(trial, own, needed)
+
+
+def _log_bayes_factor(trial: Trial, nodes: Collection[str], needed: float) -> float:
+    """Return that of the likeliest free form at some nodes on top of a trial; minus infinity where none is worth a refit."""
+    best, n_tried = _free_forms(trial, nodes, needed)
+    tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
+    return max((weigh(trial, top, n_tried).log_bayes_factor for top in _likeliest(trial, tops)), default=-np.inf)
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
@@ -66,10 +88,13 @@ def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
     return sorted(options, key=lambda trial: -weigh(simple, trial, 1, quick=True).log_bayes_factor)[:1]
 
 
-def _free_forms(trial: Trial, effects: Sequence[Effect], needed: float) -> tuple[list[Effect], int]:
-    """Return the free forms on top of a trial at the nodes where effects act, the best first, and how many places."""
-    layout = trial.fit.network.layout
-    nodes = {node for effect in effects for node in touched_nodes(effect, layout)}
+def _where(trial: Trial, effects: Sequence[Effect]) -> set[str]:
+    """Return the nodes at which effects act."""
+    return {node for effect in effects for node in touched_nodes(effect, trial.fit.network.layout)}
+
+
+def _free_forms(trial: Trial, nodes: Collection[str], needed: float) -> tuple[list[Effect], int]:
+    """Return the free forms on top of a trial at some nodes, the best first, and how many places."""
     n_tried, best = 1, dict[object, tuple[float, Effect]]()
     for screening in screened(trial, trial.fit, UNDECLARED_SHARES, fallback=True, nodes=nodes):
         n_tried = max(n_tried, len({probe.effect.place for probe in screening.probes}))

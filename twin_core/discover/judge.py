@@ -13,7 +13,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
-from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
+from twin_core.discover.form import leaves_a_repeatable_heat, more_is_left_elsewhere, outdone_by_a_free_form
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
@@ -221,7 +221,7 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
         other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, judged.trial, named, needed, most)
         beside = leaves_a_repeatable_heat(judged.trial, heats, needed, most) if heats else None
     left = [removed for removed in (beside, other.result()) if removed is not None]
-    if not left:
+    if not left or more_is_left_elsewhere(judged.trial, named, needed):
         return ""
     little = policy.REPEATABLE_SHARE * (mean_excess(simple) - mean_excess(judged.trial))
     return SMALL_REMAINDER if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW

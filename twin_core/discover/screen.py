@@ -212,10 +212,7 @@ def screen_sizes(
     for effects, edges, blocks in _portions(fit, survey, candidates):
         n_tried += len(effects)
         for found, (one, basis, residual) in zip(probes, grounds, strict=True):
-            size, products, along = _products(one, basis, residual, blocks)
-            for effect, (a, b) in zip(effects, pairwise(edges), strict=True):
-                probe = _probe(effect, size[a:b], products[a:b, a:b], along[a:b])
-                found += [] if probe is None else [probe]
+            found += _probes(effects, edges, _whitened(one, blocks), basis, residual)
     return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
 
 
@@ -229,7 +226,9 @@ def projected_responses(fit: HeatFit, survey: Survey, effects: Sequence[Effect])
     basis, residual = nuisance_basis(fit)
     found: list[FloatArray] = []
     for _, edges, blocks in _portions(fit, survey, effects):
-        _, projected = _projected(fit, basis, blocks)
+        whitened = _whitened(fit, blocks)
+        whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
+        projected = whitened - basis @ (basis.T @ whitened)
         found += [projected[:, a:b] for a, b in pairwise(edges)]
     return found, residual
 
@@ -255,38 +254,41 @@ def _portions(
         yield some, edges, responses(fit, survey, columns)
 
 
-def _projected(fit: HeatFit, basis: FloatArray, blocks: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return responses in the metric of a fit, (n_rows, n_columns), as they are and projected off a basis."""
-    whitened = _whitened(fit, blocks)
-    whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
-    projected = basis @ (basis.T @ whitened)
-    return whitened, np.subtract(whitened, projected, out=projected)
+def _probes(
+    effects: Sequence[Effect], edges: Sequence[int], whitened: FloatArray, basis: FloatArray, residual: FloatArray
+) -> list[Probe]:
+    """Return the probes of candidates that the data tell and whose best amplitudes are physical.
 
-
-def _products(
-    fit: HeatFit, basis: FloatArray, residual: FloatArray, blocks: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return norms of responses, (n_columns,), and products of the projected ones with each other and the residual."""
-    whitened, projected = _projected(fit, basis, blocks)
-    return np.linalg.norm(whitened, axis=0), projected.T @ projected, projected.T @ residual
-
-
-def _probe(effect: Effect, size: FloatArray, products: FloatArray, along: FloatArray) -> Probe | None:
-    """Return the probe of one candidate; None if the data cannot tell it or its best amplitude is not physical.
-
-    ``size`` (n_amplitudes,) are the norms of its whitened responses; ``products`` (n_amplitudes, n_amplitudes) and ``along``
-    (n_amplitudes,) are those of the projected ones with each other and with the residual.
+    ``edges`` are where the columns of each begin and end in the responses ``whitened`` (n_rows, n_columns). ``basis``
+    (n_rows + n_free, n_basis) is orthonormal, off it ``residual`` (n_rows + n_free,) is projected: P'P = W'W - (B'W)'(B'W) and
+    P'r = W'r of the projected responses P, which need not be formed. Candidates with equally many amplitudes go through the
+    algebra at once; those whose responses are no numbers are left out.
     """
-    if not (size > 0).any():
-        return None
-    scale = np.maximum(size, 1e-300)
-    told, directions = np.linalg.eigh(products / scale / scale[:, None])
-    seen = told > UNSEEN_SHARE
-    if not seen.any():
-        return None
-    gained = directions[:, seen].T @ (along / scale) / np.sqrt(told[seen])
-    moved = effect.with_amplitudes(directions[:, seen] @ (gained / np.sqrt(told[seen])) / scale)
-    return None if moved is None else Probe(effect, moved, 0.5 * float(gained @ gained))
+    n_rows = whitened.shape[0]
+    along, inside = residual[:n_rows] @ whitened, basis[:n_rows].T @ whitened
+    columns = np.ascontiguousarray(whitened.T)
+    sane = np.isfinite(along)
+    n_amplitudes = np.diff(edges)
+    found: list[Probe] = []
+    for k in np.unique(n_amplitudes).tolist():
+        at = np.asarray(edges)[:-1, None] + np.arange(k)
+        which = np.flatnonzero(n_amplitudes == k)
+        which = which[sane[at[which]].all(axis=1)]
+        at = at[which]
+        own, mimicked = columns[at], inside.T[at]
+        squares = own @ own.transpose(0, 2, 1)
+        products = squares - mimicked @ mimicked.transpose(0, 2, 1)
+        scale = np.sqrt(np.maximum(np.diagonal(squares, axis1=1, axis2=2), 1e-300))
+        told, directions = np.linalg.eigh(products / scale[:, None, :] / scale[:, :, None])
+        seen = (told > UNSEEN_SHARE) & (scale > 1e-150).any(axis=1, keepdims=True)
+        root = np.sqrt(np.where(seen, told, 1.0))
+        gained = np.where(seen, np.einsum("eij,ei->ej", directions, along[at] / scale) / root, 0.0)
+        amounts = np.einsum("eij,ej->ei", directions, gained / root) / scale
+        for e, candidate in enumerate(which.tolist()):
+            moved = effects[candidate].with_amplitudes(amounts[e]) if seen[e].any() else None
+            if moved is not None:
+                found.append(Probe(effects[candidate], moved, 0.5 * float(gained[e] @ gained[e])))
+    return found
 
 
 def joint_gain(first: FloatArray, second: FloatArray, residual: FloatArray) -> float:

@@ -13,27 +13,20 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
-from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.coarseness import by_chance, least_explained, stands
+from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
-    NO_LAW,
-    NO_MORE,
-    OUTDONE,
-    SMALL_REMAINDER,
-    Finding,
     Judged,
     Search,
     accept,
-    examine,
-    foresight_of,
     once_each,
     threshold,
     worth,
 )
+from twin_core.discover.revision import exchange, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
@@ -52,9 +45,6 @@ SETTLING_NATS = 40.0
 
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
-
-N_EXCHANGED = 2
-"""Refused options that are tried in the place of a finding."""
 
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
@@ -113,56 +103,6 @@ def search(
     progress(0.95, "comparing what was found with other names")
     tell_alternatives(state, needed)
     return state
-
-
-def reconsider(state: Search, needed: float) -> None:
-    """Name an option that was refused for the heat that it leaves, if what was found instead is no better.
-
-    What it leaves is little, and nothing or a heat without a name was found; or it leaves much, and a name was found that
-    leaves no such heat and yet is less likely and predicts worse: whichever law holds there, that one does not.
-    """
-    if len(state.findings) > 1:
-        return
-    is_named = any(not effect.fallback for finding in state.findings for effect in finding.effects)
-    reasons = (SMALL_REMAINDER, NO_LAW) if is_named else (SMALL_REMAINDER,)
-    near = [j for j in state.rejected if j.reason in reasons and len(j.trial.effects) == len(j.effects)]
-    if is_named:
-        near = [
-            j for j in near if all(worth(j) < worth(f.judged) and foresight_of(j) < f.foresight for f in state.findings)
-        ]
-    if not near:
-        return
-    best = min(near, key=worth)
-    rest = [j for j in state.rejected if j.effects != best.effects]
-    named = replace(state, trial=best.trial, findings=[Finding(replace(best, reason=""))], rejected=rest)
-    withdraw(named, needed)
-    if named.findings and all(_is_better(named.findings[0], other) for other in state.findings):
-        if is_named:
-            named.rejected += [replace(f.judged, reason=OUTDONE) for f in state.findings]
-        state.join(named)
-
-
-def tell_alternatives(state: Search, needed: float) -> None:
-    """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more."""
-    for i, finding in enumerate(state.findings):
-        kept = _attempted_without(state, {effect.place for effect in finding.effects})
-        if kept is None:
-            continue
-        compared = state.attempt(
-            partial(add_coarse_alternatives, state, kept[0], finding, needed),
-            f"alternatives to {finding.judged.labels}",
-        )
-        if compared is not None:
-            state.findings[i] = compared
-            told = {e.place for option in compared.alternatives for e in option.effects}
-            state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in told)]
-
-
-def _is_better(name: Finding, heat: Finding) -> bool:
-    """Return whether a name predicts better than what was found, or is likelier where chance tells them apart no further."""
-    if heat.foresight * policy.FORESIGHT <= name.foresight <= heat.foresight / policy.FORESIGHT:
-        return worth(name.judged) < worth(heat.judged)
-    return name.foresight < heat.foresight
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
@@ -299,128 +239,3 @@ def _judge(
     )
     found = trial.effects[len(state.trial.effects) :]
     return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)
-
-
-def withdraw(state: Search, needed: float) -> None:
-    """Withdraw what explains no more than a lumped network may leave: both may be its coarseness.
-
-    A finding must explain more than what stays beside it, and each of its effects more than any coarse network may have left.
-    Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
-    counts as unexplained, unless the others explain it too; what is left of a set that lost a member is examined as any option.
-    """
-    while state.findings:
-        left, n_readings = mean_excess(state.trial), state.trial.n_samples
-        if left <= by_chance(n_readings):
-            return
-        asked: dict[frozenset[object], float] = {}
-        for finding in state.findings:
-            places = frozenset(effect.place for effect in finding.effects)
-            is_named = not all(effect.fallback for effect in finding.effects)
-            asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
-            asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
-        without = {places: _attempted_without(state, places) for places in asked}
-        told = {
-            places: (mean_excess(kept[0]) - left) / asked[places] if asked[places] > 0.0 else np.inf
-            for places, kept in without.items()
-            if kept
-        }
-        weakest = min(told, key=lambda places: told[places], default=None)
-        if weakest is None or told[weakest] >= 1.0:
-            return
-        for finding in state.findings:
-            effects = tuple(effect for effect in finding.effects if effect.place in weakest)
-            if effects:
-                state.rejected.append(replace(finding.judged, effects=effects, reason=NO_MORE))
-        kept = without[weakest]
-        assert kept is not None
-        shrunk = [f for f in state.findings if any(e.place in weakest for e in f.effects)]
-        rests = [{e.place for e in f.effects} - weakest for f in shrunk]
-        _drop(state, weakest, *kept)
-        for rest in filter(None, rests):
-            _examine_again(state, rest, needed)
-
-
-def _examine_again(state: Search, places: Collection[object], needed: float) -> None:
-    """Withdraw the finding at places if by itself it does not pass what any option must; little that it leaves was explained."""
-    without = _attempted_without(state, places)
-    finding = next(f for f in state.findings if {effect.place for effect in f.effects} == places)
-    if without is None:
-        return
-    option = replace(finding.judged, trial=state.trial)
-    examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
-    if examined is None:
-        return
-    if examined[0].reason in ("", SMALL_REMAINDER):
-        again = replace(finding, judged=replace(finding.judged, validation=examined[0].validation))
-        state.findings = [again if f is finding else f for f in state.findings]
-        return
-    state.rejected.append(examined[0])
-    _drop(state, places, *without)
-
-
-def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
-    """Put an effect that was refused beside a finding in its place, if both act there and it explains more; False if none does.
-
-    The first look may take a part of what is missing for the whole: a heater that came on once for a load with an onset. What
-    switches it off again is then tried beside it, where it does not belong.
-    """
-    layout = state.trial.fit.network.layout
-    for option in sorted(refused, key=worth)[:N_EXCHANGED]:
-        for finding in state.findings:
-            here, there = ({n for e in j.effects for n in touched_nodes(e, layout)} for j in (option, finding.judged))
-            if here & there and len(option.effects) == 1 and worth(option) < worth(finding.judged):
-                replaced = partial(_in_place_of, state, finding, option, needed)
-                if state.attempt(replaced, f"{option.labels} in place of {finding.judged.labels}"):
-                    return True
-    return False
-
-
-def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float) -> bool:
-    """Take an option instead of a finding, if it is likelier by the odds asked for and passes; return whether it did."""
-    places = {effect.place for effect in finding.effects}
-    kept = _attempted_without(state, places)
-    if kept is None:
-        return False
-    without, lost = kept
-    trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
-    instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
-    if instead.evidence.log_bayes_factor <= lost + needed:
-        return False
-    examined, _ = examine(without, instead, needed)
-    if examined.reason:
-        return False
-    state.rejected = [j for j in state.rejected if j.effects != option.effects]
-    state.rejected.append(replace(finding.judged, reason=OUTDONE))
-    state.findings = [Finding(examined) if f is finding else f for f in state.findings]
-    state.trial = trial
-    return True
-
-
-def prune(state: Search, needed: float) -> None:
-    """Drop findings, and members of a set that was found together, that the others have made superfluous."""
-    for finding in list(state.findings):
-        for effect in finding.effects if len(finding.effects) > 1 or finding is not state.findings[-1] else ():
-            if all(other.place == effect.place for other in state.trial.effects):
-                continue
-            kept = _attempted_without(state, {effect.place})
-            if kept is not None and kept[1] <= needed:
-                _drop(state, {effect.place}, *kept)
-
-
-def _attempted_without(state: Search, places: Collection[object]) -> tuple[Trial, float] | None:
-    """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed."""
-
-    def weighed() -> tuple[Trial, float]:
-        others = [effect for effect in state.trial.effects if effect.place not in places]
-        without = try_effects(state.trial, others, n_passes=10) if others else state.base
-        return without, weigh(without, state.trial, 1).log_bayes_factor
-
-    return state.attempt(weighed, "the model without " + " and ".join(str(place) for place in places))
-
-
-def _drop(state: Search, places: Collection[object], without: Trial, lost: float) -> None:
-    """Go on without the effects at places, whose log Bayes factor was ``lost``."""
-    state.trial = without
-    for place in places:
-        state.findings = [f.without(place, lost, without) for f in state.findings]
-    state.findings = [f for f in state.findings if f.effects]

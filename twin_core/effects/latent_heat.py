@@ -17,6 +17,10 @@ N_CENTRES = 9
 WIDTH_SHARES = (0.03, 0.08, 0.2)
 """Widths that are tried, as shares of the visited range."""
 
+WIDEST_SHARE = 0.25
+"""The greatest width, as a share of the visited range: centred in it, two standard deviations on either side fill it. Of a wider
+change of phase the record does not see what it takes up in all."""
+
 
 @dataclass(frozen=True)
 class Melting:
@@ -56,11 +60,13 @@ class LatentHeat(Effect):
     sentence = "a phase change in {node} was missing"
 
     def qualities(self) -> tuple[Quality, ...]:
-        """Return the latent heat, where it melts and over what width."""
+        """Return the latent heat, where it melts and over what width: within what the record visits, or L is a guess."""
+        low_K, high_K = self.settings.get("low_K"), self.settings.get("high_K")
+        widest_K = None if low_K is None or high_K is None else WIDEST_SHARE * (high_K - low_K)
         return (
             Quality("L_J", "J", null=0.0, positive=True),
-            Quality("T_m_K", "K", prior_std=20.0),
-            Quality("w_K", "K", positive=True, prior_std=1.0),
+            Quality("T_m_K", "K", prior_std=20.0, lower=low_K, upper=high_K),
+            Quality("w_K", "K", positive=True, prior_std=1.0, upper=widest_K),
         )
 
     def addition(self, layout: Layout) -> Addition:
@@ -78,4 +84,5 @@ class LatentHeat(Effect):
         low, high = np.quantile(survey.temperature_K(where["node"]), (0.005, 0.995))
         for centre in np.linspace(low, high, N_CENTRES + 2)[1:-1] if high > low else ():
             for share in WIDTH_SHARES:
-                yield cls(where, {"L_J": 0.0, "T_m_K": float(centre), "w_K": float(share * (high - low))})
+                start = {"L_J": 0.0, "T_m_K": float(centre), "w_K": float(share * (high - low))}
+                yield cls(where, start, {"low_K": float(low), "high_K": float(high)})

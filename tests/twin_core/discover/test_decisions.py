@@ -1,5 +1,6 @@
 """The deciding rooms at their boundaries: what is likely enough, what predicts, what stands, and what goes first."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from threading import Barrier, Thread
 from types import SimpleNamespace
@@ -10,8 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin_core.discover import judge, policy
-from twin_core.discover import search as searching
+from twin_core.discover import judge, policy, revision
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.judge import (
@@ -44,7 +44,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.search import exchange, reconsider, withdraw
+from twin_core.discover.revision import exchange, reconsider, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -273,8 +273,8 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
         names = {e.where["node"] for e in effects}
         return stub(*effects, left=left + sum(value for name, value in own.items() if name not in names))
 
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
     state.findings = [Finding(judged(name, 50.0)) for name in own]
     withdraw(state, NEEDED)
@@ -286,8 +286,8 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
 def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """As an ablation sets them."""
     monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     state = Search(stub(load("n0"), left=1.0), stub(left=1.0), findings=[Finding(judged("n0", 50.0))])
     withdraw(state, NEEDED)
     assert state.findings
@@ -313,15 +313,15 @@ def test_of_effects_found_together_each_must_explain_something(
         names = {e.where["node"] for e in effects}
         return stub(*effects, left=left + sum(value for name, value in parts.items() if name not in names))
 
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     asked: list[tuple[Effect, ...]] = []
 
     def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         asked.append(option.effects)
         return replace(option, reason=reason), False
 
-    monkeypatch.setattr(searching, "examine", examined)
+    monkeypatch.setattr(revision, "examine", examined)
     both = (load("n0"), load("n1"))
     state = Search(refitted(both), refitted(()))
     state.findings = [Finding(Judged(both, Evidence(50.0, 0.0), state.trial))]
@@ -334,7 +334,7 @@ def test_of_effects_found_together_each_must_explain_something(
 def test_beside_a_heat_without_a_name_all_that_stays_counts(
     monkeypatch: pytest.MonkeyPatch, explained: float, stands: bool
 ) -> None:
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     free = unnamed()
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
     state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
@@ -395,7 +395,10 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     simple = stub(left=10.0 if left == 1.0 else left)
     monkeypatch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: beside)
     monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
     assert judge._merely_resembles(simple, option, NEEDED) == reason
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: True)
+    assert judge._merely_resembles(simple, option, NEEDED) == ""
 
 
 def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
@@ -403,6 +406,7 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
     lag = REGISTRY["sensor_lag"]({"sensor": "T"}, {"tau_s": 30.0})
     option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
         patch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: 1e9)
         patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
@@ -446,16 +450,36 @@ def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
     ],
     ids=["likelier and predicts better", "less likely", "predicts worse"],
 )
-def test_no_name_stands_that_one_refused_for_what_it_leaves_excels(
+def test_no_name_stands_that_one_refused_for_the_little_it_leaves_excels(
     nats: float, foresight: float, names: list[str]
 ) -> None:
-    """Whichever law holds there, a name that is less likely and predicts worse than one that is no law does not."""
+    """Less likely, and it predicts worse: what the other one leaves is no reason to name this one."""
     found = judged("f", 70.0, foresight=0.6)
     state = Search(found.trial, stub(), findings=[Finding(found)])
-    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=NO_LAW)]
+    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=SMALL_REMAINDER)]
     reconsider(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == names
-    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [NO_LAW])
+    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [SMALL_REMAINDER])
+
+
+def test_what_stands_in_part_only_gives_way_to_what_stands_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the likelier pair one effect explains next to nothing: its other half is no answer to what the pair was found for."""
+    left = 2.0 * CHANCE
+
+    def refitted(effects: Sequence[Effect]) -> Trial:
+        names = {str(e.where["node"]) for e in effects}
+        return stub(*effects, left=left + (0.0 if names & {"a", "c"} else 99.0))
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (judged, False))
+    both = (load("a"), load("b"))
+    pair = Judged(both, Evidence(99.0, 0.0), refitted(both), None, SMALL_REMAINDER)
+    single = Judged((load("c"),), Evidence(70.0, 0.0), refitted([load("c")]), None, SMALL_REMAINDER)
+    state = Search(refitted(()), refitted(()), rejected=[pair, single])
+    reconsider(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == ["c"]
+    assert pair in state.rejected and single not in state.rejected
 
 
 def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
@@ -477,11 +501,11 @@ def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
 def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
     monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
 ) -> None:
-    monkeypatch.setattr(searching, "touched_nodes", lambda effect, layout: {effect.where["node"]})
-    monkeypatch.setattr(searching, "_attempted_without", lambda state, places: (stub(), 30.0))
-    monkeypatch.setattr(searching, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(searching, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    monkeypatch.setattr(revision, "touched_nodes", lambda effect, layout: {effect.where["node"]})
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 30.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
     found = kind_at("heat_load_step", "n0", 30.0)
     cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
     refused = replace(option, reason=NO_FORESIGHT)

@@ -1,6 +1,6 @@
 """A name stands for a law: what merely resembles the missing heat leaves the difference behind. Readings are SciPy's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
-from twin_core.discover.form import leaves_a_repeatable_heat, outdone_by_a_free_form
+from twin_core.discover.form import leaves_a_repeatable_heat, more_is_left_elsewhere, outdone_by_a_free_form
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
+from twin_core.discover.revision import prune
 from twin_core.discover.screen import screen, survey_of
-from twin_core.discover.search import prune
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.proportional_heater import ProportionalHeater
@@ -33,6 +33,21 @@ SPEC = TwinSpec.model_validate(
         "nodes": [{"id": "a", "sensor": "T_a", "capacity_J_per_K": {"value": CAPACITY}}],
         "conductors": [{"between": ["a", "wall"], "conductance_W_per_K": {"value": LEAK}}],
         "loads": [{"channel": "Q", "node": "a"}],
+    }
+)
+COUPLING = 0.8
+PAIR = TwinSpec.model_validate(
+    {
+        "twin": "pair",
+        "boundaries": {"wall": {"value_K": WALL_K}},
+        "channels": {f"T_{n}": {"kind": "temperature", "unit": "K", "noise_std": NOISE_K} for n in "ab"}
+        | {f"Q_{n}": {"kind": "power", "unit": "W"} for n in "ab"},
+        "nodes": [{"id": n, "sensor": f"T_{n}", "capacity_J_per_K": {"value": CAPACITY}} for n in "ab"],
+        "conductors": [
+            *({"between": [n, "wall"], "conductance_W_per_K": {"value": LEAK}} for n in "ab"),
+            {"between": ["a", "b"], "conductance_W_per_K": {"value": COUPLING}},
+        ],
+        "loads": [{"channel": f"Q_{n}", "node": n} for n in "ab"],
     }
 )
 NEEDED = threshold(0.01)
@@ -101,6 +116,44 @@ def test_a_smooth_law_is_not_outdone_by_the_free_form_that_contains_it(law: str)
     worth = weigh(base, trial, 1).log_bayes_factor
     assert worth > NEEDED
     assert outdone_by_a_free_form(base, trial, trial.effects, NEEDED, most_left(worth, NEEDED)) is None
+
+
+def pair_record(heats_W: Sequence[Callable[[float], float]]) -> Record:
+    """Return the readings of two of these nodes, coupled, each with a hidden heat of its own and the power in turn."""
+    powers = [POWER, np.roll(POWER, 100)]
+    readings = [np.array([282.0, 282.0])]
+    for k in range(TIMES.size - 1):
+
+        def rate(_: float, x: np.ndarray, k: int = k) -> list[float]:
+            exchanged = COUPLING * (x[1] - x[0])
+            own = [p[k] + LEAK * (WALL_K - t) + heat(t) for p, t, heat in zip(powers, x, heats_W, strict=True)]
+            return [(own[0] + exchanged) / CAPACITY, (own[1] - exchanged) / CAPACITY]
+
+        readings.append(solve_ivp(rate, TIMES[k : k + 2], readings[-1], rtol=1e-9, atol=1e-9).y[:, -1])
+    measured = np.array(readings) + NOISE_K * np.random.default_rng(1).normal(size=(TIMES.size, 2))
+    return Record(TIMES, {"T_a": measured[:, 0], "T_b": measured[:, 1], "Q_a": powers[0], "Q_b": powers[1]})
+
+
+@pytest.mark.parametrize(
+    ("heats_W", "elsewhere"),
+    [((heater, resonance), True), ((resonance, lambda x: 0.0), False), ((heater, lambda x: 0.0), False)],
+    ids=["the other node lacks a heat", "no law", "the law"],
+)
+def test_what_repeats_elsewhere_is_no_remainder_of_a_name(
+    heats_W: tuple[Callable[[float], float], Callable[[float], float]], elsewhere: bool
+) -> None:
+    base = declared(PAIR, pair_record(heats_W))
+    fit, survey = base.fit, survey_of(base.fit)
+    probes = screen(fit, survey, ProportionalHeater.starts({"node": "a"}, survey)).probes[:3]
+    trial = max(
+        (try_effects(base, [probe.effect], n_passes=15) for probe in probes), key=lambda trial: trial.fit.log_posterior
+    )
+    assert more_is_left_elsewhere(trial, trial.effects, NEEDED) is elsewhere
+
+
+def test_a_single_node_has_no_elsewhere() -> None:
+    _, trial = named(resonance)
+    assert not more_is_left_elsewhere(trial, trial.effects, NEEDED)
 
 
 def test_a_member_that_the_others_make_superfluous_is_dropped_from_its_set() -> None:

@@ -212,3 +212,21 @@ def test_a_long_record_is_screened_in_portions_with_the_same_result(monkeypatch:
         assert len(gains) == len(one.probes)
         for probe in one.probes:
             assert gains[id(probe.start)] == pytest.approx(probe.gain, rel=1e-9, abs=1e-9)
+
+
+def test_a_response_that_is_no_number_leaves_out_its_candidate_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = fit_of(problem())
+    survey = survey_of(fit)
+    candidates = [REGISTRY["leak_to_boundary"]({"node": n, "boundary": "room"}, {"G_W_per_K": 0.0}) for n in "abc"]
+    sound = {probe.start.label: probe.gain for probe in screen(fit, survey, candidates[1:]).probes}
+
+    def overflowing(*arguments: Any) -> list[np.ndarray]:
+        blocks = responses(*arguments)
+        for block in blocks:
+            block[5, :, 0] = np.inf
+        return blocks
+
+    monkeypatch.setattr(screening_module, "responses", overflowing)
+    with np.errstate(invalid="ignore"):
+        found = {probe.start.label: probe.gain for probe in screen(fit, survey, candidates).probes}
+    assert found == pytest.approx(sound)

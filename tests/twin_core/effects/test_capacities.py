@@ -7,7 +7,15 @@ import pytest
 from scipy.integrate import cumulative_simpson, solve_ivp
 from scipy.special import ndtr
 
-from tests.helpers import at_named, central_difference, conductive_spec, record_of
+from tests.helpers import (
+    at_named,
+    central_difference,
+    conductive_spec,
+    every_term_network,
+    points,
+    record_of,
+    survey_of,
+)
 from twin_core.effects import REGISTRY, Effect
 from twin_core.network import storage
 from twin_core.network.model import Network, build_network
@@ -181,3 +189,18 @@ def test_a_capacity_stays_positive_whatever_the_temperature(kappa: float) -> Non
     temperature = np.linspace(1.0, 4000.0, 5000)
     part = network.capacities[0].evaluate(temperature, np.array([kappa, C]))
     assert (C + part.extra_J_per_K > 0.0).all()
+
+
+def test_a_change_of_phase_lies_within_what_was_visited() -> None:
+    """Melting that the record has seen one flank of may take up anything: no fit may go there."""
+    network = every_term_network()
+    survey = survey_of(network, points(network, 400))
+    visited_K = survey.temperature_K("a")
+    starts = list(REGISTRY["latent_heat"].starts({"node": "a"}, survey))
+    assert starts
+    for effect in starts:
+        centre, width = (next(q for q in effect.qualities() if q.name == name) for name in ("T_m_K", "w_K"))
+        for far_K in (100.0, 1000.0):
+            assert visited_K.min() <= centre.transform.to_value(far_K) <= visited_K.max()
+        assert width.transform.to_value(np.log(1000.0)) <= 0.25 * np.ptp(visited_K)
+        assert width.transform.to_value(np.log(effect.values["w_K"])) == pytest.approx(effect.values["w_K"])
