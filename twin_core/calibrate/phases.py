@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import FloatArray, Json, Progress, no_progress
+from twin_core.calibrate.approach import misfit_K
 from twin_core.calibrate.choice import by_sensitivity
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.explained import explained
@@ -306,13 +307,19 @@ def _with_noise(spec: TwinSpec, transients: list[Record]) -> TwinSpec:
 
 
 def _as_declared(problem: Problem) -> list[FloatArray]:
-    """Return what the model reads at the declared values, its initial states fitted alone; NaN where it has no solution."""
+    """Return what the model reads at the declared values, its initial states fitted alone; NaN where it has no solution.
+
+    The misfit counts as noise: weighed by that of the sensors alone, initial temperatures that no sensor reads would go to any
+    length to make up for values that are wrong.
+    """
     parameters = problem.network.parameters
     held = tuple(replace(p, frozen=True) for p in parameters.parameters)
     fixed = problem.with_network(problem.network.with_parameters(replace(parameters, parameters=held)))
-    found = list(minimise(fixed, fixed.start()).fit.predicted_K)
-    if len(found) == len(problem.segments):
-        return found
+    start = fixed.start()
+    fit = fixed.solve(start)
+    if np.isfinite(fit.cost):
+        weighed = replace(fixed, noise_K=np.hypot(fixed.noise_K, misfit_K(fixed, fit)))
+        return list(minimise(weighed, start, near=fit).fit.predicted_K)
     return [np.full(segment.measured_K.shape, np.nan) for segment in problem.segments]
 
 
