@@ -15,7 +15,7 @@ from twin_core.parameters.parameter import Parameter
 N_PEAKS = 6
 SAMPLES_PER_PERIOD = 4.0
 LEAST_PERIODS = 2.0
-"""What went through fewer of its periods has not come back once: a slow change is no period."""
+"""Periods within the longest segment, at least: what went through fewer has not come back once; a slow change is no period."""
 
 FINER = 4
 """The spectrum is read at a spacing this much finer than one over the record's length."""
