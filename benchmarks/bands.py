@@ -34,12 +34,12 @@ class Band:
 def bands(truth: dict[str, Any], found: dict[str, Any] | None) -> list[Band]:
     """Return a band for every parameter of a found effect that the truth has too.
 
-    Onsets are scored apart, settings have no band, and a table is compared where both have the same knots.
+    Onsets and ends are scored apart, settings have no band, and a table is compared where both have the same knots.
     """
     held: list[Band] = []
     for name, true in truth.items():
         row = (found or {}).get(name)
-        if row is None or row["std"] is None or name == "time":
+        if row is None or row["std"] is None or name in ("time", "stop"):
             continue
         if not isinstance(row["std"], list):
             held.append(Band(name, row["mean"], row["std"], _about(true, truth, found or {})))
