@@ -21,3 +21,9 @@ def test_a_table_is_compared_at_its_own_knots_and_an_onset_elsewhere() -> None:
     assert [band.holds for band in bands(truth, found)] == [True, False]
     assert bands(truth | {"knots": [0.0, 2.0]}, found) == []
     assert bands(truth, None) == []
+
+
+def test_an_end_on_the_calendar_has_no_band() -> None:
+    """As an onset it is scored apart: both are dates where the record is dated."""
+    found = {"Q_W": {"mean": 5.0, "std": 0.1}, "stop": {"mean": "2026-03-01T00:00:00Z", "std": 30.0}}
+    assert [band.name for band in bands({"Q_W": 5.05, "stop": 4000.0}, found)] == ["Q_W"]
