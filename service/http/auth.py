@@ -37,7 +37,7 @@ class Gate:
         if key is not None or not self._keys.needed:
             state["who"] = "this machine" if key is None else key.name
         if refusal is None:
-            state["role"] = Role.operate if not self._keys.needed else None if key is None else key.role
+            state["role"] = Role.operate if not self._keys.needed else None if key is None or key.is_over else key.role
             await self._app(scope, receive, send)
         else:
             status, detail = refusal

@@ -1,5 +1,6 @@
 """Keys that change, the audit log, webhooks, backups: what an operator relies on for years."""
 
+import asyncio
 import hashlib
 import hmac
 import http.server
@@ -17,6 +18,8 @@ import pytest
 
 from replay.cli.main import main
 from service.errors import Refusal
+from service.http.auth import Gate
+from service.keys import Key, Keys, Role
 from service.live.silence import Silence
 from service.monitoring.logs import JsonLines
 from service.running import dispatch
@@ -319,3 +322,16 @@ def test_a_specification_is_registered_and_changed_from_a_shell(
 
 def test_refusals_know_no_http() -> None:
     assert not hasattr(Refusal("x"), "status")
+
+
+@pytest.mark.parametrize(("expires_us", "role"), [(None, Role.operate), (1, None)])
+def test_an_expired_key_carries_no_role_to_what_is_open(expires_us: int | None, role: Role | None) -> None:
+    seen: list[Any] = []
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        seen.append(scope["state"]["role"])
+
+    key = Key("anna", Role.operate, hashlib.sha256(b"secret").digest(), expires_us)
+    scope = {"type": "http", "path": "/healthz", "headers": [(b"authorization", b"Bearer secret")]}
+    asyncio.run(Gate(app, Keys([key]))(scope, None, None))  # type: ignore[arg-type]
+    assert seen == [role]
