@@ -32,6 +32,8 @@ READS = 200
 ROUNDS = 3
 
 Server = psycopg.Connection[tuple[object, ...]]
+Tell = Callable[..., None]
+"""Adds a row of cells to the table."""
 
 
 @contextlib.contextmanager
@@ -111,6 +113,78 @@ def count(server: Server) -> int:
     return int(str(row[0])) if row else 0
 
 
+def measure_ingest(url: str, tell: Tell) -> None:
+    """Measure small batches of many twins beside plain COPY and merge."""
+    for n, batches_each in SHAPES:
+        found = ingest(url, n, batches_each)
+        ours, alone, copied = np.median(found, axis=0)
+        ratios = np.sort(100 * found[:, 0] / found[:, 2])
+        tell(
+            f"ingest, batches of {n} × {CHANNELS}",
+            f"{ours:,.0f} samples/s; one by one {alone:,.0f}",
+            f"COPY and INSERT … SELECT {copied:,.0f}",
+            f"{np.median(ratios):.0f} % ({ratios[0]:.0f} to {ratios[-1]:.0f})",
+        )
+
+
+def measure_reads(server: Server, tell: Tell) -> None:
+    """Measure the store's reads beside those of a table that is not divided."""
+    for what, day in (("newest", DAYS - 1), ("middle", DAYS // 2)):
+        start = BEGIN_US + day * DAY_US
+        divided = read_ms(server, "chunk", WITHIN, lambda twin, a=start: within(twin, a, a + DAY_US))  # type: ignore[misc]
+        plain = "twin = ? AND last_us >= ? AND first_us < ?"
+        whole = read_ms(server, "undivided", plain, lambda twin, a=start: (twin, a, a + DAY_US))  # type: ignore[misc]
+        tell(
+            f"read of the {what} day of {DAYS}",
+            f"{divided:.2f} ms",
+            f"undivided {whole:.2f} ms",
+            f"{divided / whole:.1f}",
+        )
+    newest = "twin = ? AND last_seq > ?"
+    divided, whole = (
+        read_ms(server, table, newest, lambda twin: (twin, DAYS * ROWS_A_DAY - 1)) for table in ("chunk", "undivided")
+    )
+    tell("read of what came last", f"{divided:.2f} ms", f"undivided {whole:.2f} ms", f"{divided / whole:.1f}")
+
+
+def measure_retention(database: Database, server: Server, tell: Tell) -> None:
+    """Measure the dropping of whole quarters beside deleting segments one by one."""
+    before = count(server)
+    for key in range(1, TWINS // 2 + 1):
+        database.submit(retention.put, key, Retention(samples_days=float(KEPT_DAYS))).result()
+
+    def sweep() -> None:
+        """Delete what half of the twins keep no longer, while the others keep all."""
+        for twin in database.engine.read(retention.due):
+            while database.submit(retention.sweep_old, twin).result():
+                pass
+
+    deleted = logged(server, sweep)
+    vacuumed = logged(server, lambda: server.execute("VACUUM chunk"))
+    n = before - count(server)
+    database.submit(lambda c: c.execute("UPDATE twin SET retention = '{}'") and None).result()
+    server.execute("INSERT INTO chunk SELECT * FROM undivided WHERE id NOT IN (SELECT id FROM chunk)")
+    for key in range(1, TWINS + 1):
+        database.submit(retention.put, key, Retention(samples_days=float(KEPT_DAYS))).result()
+    gone: list[int] = []
+
+    def drop() -> None:
+        """Drop what no twin keeps."""
+        while found := database.engine.drop_old():
+            gone.append(found)
+
+    dropped = logged(server, drop)
+    each, quarter = 1e3 * (deleted[0] + vacuumed[0]) / n, 1e3 * dropped[0] / len(gone)
+    tell(
+        f"retention, {KEPT_DAYS} of {DAYS} days",
+        f"{quarter:.0f} ms a quarter of {sum(gone) // len(gone)} segments",
+        f"one by one {each:.2f} ms a segment",
+        f"{quarter * len(gone) / sum(gone) / each:.2f} a segment",
+    )
+    logs = [1e3 * dropped[1] / len(gone), 1e3 * (deleted[1] + vacuumed[1]) / n]
+    tell("of the database's log for it", f"{logs[0]:.0f} kB a quarter", f"{logs[1]:.1f} kB a segment", "")
+
+
 def main() -> None:
     """Measure and write the table."""
     rows: list[list[str]] = []
@@ -122,73 +196,13 @@ def main() -> None:
 
     with contextlib.ExitStack() as stack:
         url = os.environ.get("TWIN_TEST_POSTGRES_URL") or stack.enter_context(own_server("fsync=on")).url
-        for n, batches_each in SHAPES:
-            found = ingest(url, n, batches_each)
-            ours, alone, copied = np.median(found, axis=0)
-            ratios = np.sort(100 * found[:, 0] / found[:, 2])
-            beside = f"COPY and INSERT … SELECT {copied:,.0f}"
-            what = f"ingest, batches of {n} × {CHANNELS}"
-            tell(
-                what,
-                f"{ours:,.0f} samples/s; one by one {alone:,.0f}",
-                beside,
-                f"{np.median(ratios):.0f} % ({ratios[0]:.0f} to {ratios[-1]:.0f})",
-            )
+        measure_ingest(url, tell)
         place = stack.enter_context(fresh_database(url))
         database = Database(place)
         server = stack.enter_context(psycopg.connect(place, autocommit=True))
         fill(database, server)
-        for what, day in (("newest", DAYS - 1), ("middle", DAYS // 2)):
-            start = BEGIN_US + day * DAY_US
-            divided = read_ms(server, "chunk", WITHIN, lambda twin, a=start: within(twin, a, a + DAY_US))  # type: ignore[misc]
-            plain = "twin = ? AND last_us >= ? AND first_us < ?"
-            whole = read_ms(server, "undivided", plain, lambda twin, a=start: (twin, a, a + DAY_US))  # type: ignore[misc]
-            tell(
-                f"read of the {what} day of {DAYS}",
-                f"{divided:.2f} ms",
-                f"undivided {whole:.2f} ms",
-                f"{divided / whole:.1f}",
-            )
-        newest = "twin = ? AND last_seq > ?"
-        divided, whole = (
-            read_ms(server, table, newest, lambda twin: (twin, DAYS * ROWS_A_DAY - 1))
-            for table in ("chunk", "undivided")
-        )
-        tell("read of what came last", f"{divided:.2f} ms", f"undivided {whole:.2f} ms", f"{divided / whole:.1f}")
-        before = count(server)
-        for key in range(1, TWINS // 2 + 1):
-            database.submit(retention.put, key, Retention(samples_days=float(KEPT_DAYS))).result()
-
-        def sweep() -> None:
-            """Delete what half of the twins keep no longer, while the others keep all."""
-            for twin in database.engine.read(retention.due):
-                while database.submit(retention.sweep_old, twin).result():
-                    pass
-
-        deleted = logged(server, sweep)
-        vacuumed = logged(server, lambda: server.execute("VACUUM chunk"))
-        n = before - count(server)
-        database.submit(lambda c: c.execute("UPDATE twin SET retention = '{}'") and None).result()
-        server.execute("INSERT INTO chunk SELECT * FROM undivided WHERE id NOT IN (SELECT id FROM chunk)")
-        for key in range(1, TWINS + 1):
-            database.submit(retention.put, key, Retention(samples_days=float(KEPT_DAYS))).result()
-        gone: list[int] = []
-
-        def drop() -> None:
-            """Drop what no twin keeps."""
-            while found := database.engine.drop_old():
-                gone.append(found)
-
-        dropped = logged(server, drop)
-        each, quarter = 1e3 * (deleted[0] + vacuumed[0]) / n, 1e3 * dropped[0] / len(gone)
-        tell(
-            f"retention, {KEPT_DAYS} of {DAYS} days",
-            f"{quarter:.0f} ms a quarter of {sum(gone) // len(gone)} segments",
-            f"one by one {each:.2f} ms a segment",
-            f"{quarter * len(gone) / sum(gone) / each:.2f} a segment",
-        )
-        logs = [1e3 * dropped[1] / len(gone), 1e3 * (deleted[1] + vacuumed[1]) / n]
-        tell("of the database's log for it", f"{logs[0]:.0f} kB a quarter", f"{logs[1]:.1f} kB a segment", "")
+        measure_reads(server, tell)
+        measure_retention(database, server, tell)
         database.close()
     note = (
         f"Ingest: 50 twins, medians of {ROUNDS} runs of each in turn, and the median, least and greatest of their ratios; "
