@@ -34,10 +34,8 @@ def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: fl
     float, or None
         Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
-    best, n_tried = _free_forms(trial, _where(trial, effects), needed)
-    tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
-    supported = [top for top in _likeliest(trial, tops) if weigh(trial, top, n_tried).log_bayes_factor > most]
-    return max((mean_excess(trial) - mean_excess(top) for top in supported), default=None)
+    worth, top = _likeliest_on_top(trial, _where(trial, effects), needed)
+    return mean_excess(trial) - mean_excess(top) if worth > most else None
 
 
 def outdone_by_a_free_form(
@@ -72,15 +70,20 @@ def more_is_left_elsewhere(trial: Trial, effects: Sequence[Effect], needed: floa
         As in :func:`leaves_a_repeatable_heat`.
     """
     own = _where(trial, effects)
-    away = _log_bayes_factor(trial, set(trial.fit.network.layout.nodes) - own, needed)
-    return away > needed and away > _log_bayes_factor(trial, own, needed)
+    away, _ = _likeliest_on_top(trial, set(trial.fit.network.layout.nodes) - own, needed)
+    return away > needed and away > _likeliest_on_top(trial, own, needed)[0]
 
 
-def _log_bayes_factor(trial: Trial, nodes: Collection[str], needed: float) -> float:
-    """Return that of the likeliest free form at some nodes on top of a trial; minus infinity where none is worth a refit."""
+def _likeliest_on_top(trial: Trial, nodes: Collection[str], needed: float) -> tuple[float, Trial]:
+    """Return the log Bayes factor of the likeliest free form at some nodes on top of a trial, and the trial with it.
+
+    Minus infinity and the trial as it is where none is worth a refit.
+    """
     best, n_tried = _free_forms(trial, nodes, needed)
     tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
-    return max((weigh(trial, top, n_tried).log_bayes_factor for top in _likeliest(trial, tops)), default=-np.inf)
+    for top in _likeliest(trial, tops):
+        return weigh(trial, top, n_tried).log_bayes_factor, top
+    return -np.inf, trial
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
