@@ -18,14 +18,11 @@ from service.store.sqlite.vacuum import vacuum
 log = logging.getLogger("service.store")
 T = TypeVar("T")
 
-PRAGMAS = (
-    "auto_vacuum = INCREMENTAL",  # holds for new files; others keep what they were made with
-    "journal_mode = WAL",
-    "synchronous = FULL",
-    "foreign_keys = ON",
-    "mmap_size = 268435456",
-    "temp_store = MEMORY",
-)
+ALL = ("mmap_size = 268435456", "temp_store = MEMORY")
+READER = (*ALL, "query_only = ON")
+WRITER = (*ALL, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
+NEW_FILE = ("auto_vacuum = INCREMENTAL",)
+"""How a connection is set up; what writes to a file is set where it must be: a full disk must stop no reader."""
 FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
 
 
@@ -139,9 +136,9 @@ def _open(path: Path) -> sqlite3.Connection:
 def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=10.0)
     connection.create_function("clock_us", 0, now_us)
-    settings = PRAGMAS + (("query_only = ON",) if read_only else ())
     try:
-        for setting in settings:
+        is_new = connection.execute("PRAGMA page_count").fetchone()[0] == 0
+        for setting in READER if read_only else (NEW_FILE if is_new else ()) + WRITER:
             connection.execute(f"PRAGMA {setting}")
     except sqlite3.Error:
         connection.close()

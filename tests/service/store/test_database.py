@@ -1,6 +1,7 @@
 """One writer for all: shared commits, isolated failures, readers beside it, migrations."""
 
 import asyncio
+import resource
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 
 from service.store.connection import Connection
 from service.store.database import Database
-from service.store.errors import StoreError
+from service.store.errors import DiskFull, StoreError
 from service.store.sqlite import migrations
 from tests.service.postgres import STORES, place_of
 
@@ -100,3 +101,22 @@ def test_a_failed_step_leaves_no_trace(tmp_path: Path, monkeypatch: pytest.Monke
     with sqlite3.connect(path) as connection:
         assert connection.execute("SELECT count(*) FROM sqlite_master WHERE name = 'half'").fetchone() == (0,)
     connection.close()
+
+
+def test_a_full_disk_stops_neither_a_reader_nor_a_start(tmp_path: Path) -> None:
+    """A connection that is set up writes nothing to a file that exists; a file-size limit stands in for the disk."""
+    file = tmp_path / "twin.sqlite3"
+    database = Database(file)
+    database.submit(lambda c: c.execute("CREATE TABLE t (x)") and None).result()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (Path(f"{file}-wal").stat().st_size + 100, limits[1]))
+    try:
+        with pytest.raises(DiskFull):
+            database.submit(lambda c: c.execute("INSERT INTO t VALUES (zeroblob(100000))") and None).result()
+        assert database.engine.read(numbers) == []  # the first read: its connection is made now
+        database.close()
+        database = Database(file)
+        assert database.engine.read(numbers) == []
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        database.close()
