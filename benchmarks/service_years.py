@@ -109,6 +109,8 @@ def job(client: TwinClient, folder: Path, kind: str, target: str, twin: str = "c
     said = made.message.partition("; from ")[2]
     took_s = time.perf_counter() - begun_s
     took = f"{took_s:.0f} s ({memory['cpu_s']:.0f} s of computing), {memory['worker']:.0f} MiB in its process"
+    if "ended at its deadline" in made.message:
+        took += "; the search ended at its deadline with the best so far"
     return [f"{kind} {settings or ''}: {said}", took, target]
 
 
