@@ -263,4 +263,5 @@ def test_retention_keeps_what_it_says(make_client: Any) -> None:
     assert archive["time"][0] == client.get(TWIN).json()["first_time"]
     assert len(client.get(f"{TWIN}/calibrations").json()["jobs"]) == 1
     assert client.get(f"{TWIN}/forecast", params={"horizon_s": 10}).json()["behind_s"] == 0.0
-    assert client.request("PUT", f"{TWIN}/retention", json={"samples_days": -1}).status_code == 422
+    for wrong in ({"samples_days": -1}, {"residuals_days": 1e300}, {"jobs": 10**30}):  # what no database can count back
+        assert client.request("PUT", f"{TWIN}/retention", json=wrong).status_code == 422
