@@ -146,7 +146,7 @@ def in_turn(sides: Sequence[Side], n_twins: int, rows: int, blocks: int, block: 
 
 
 def share_of(took: NDArray[np.float64], ours: int, other: int) -> str:
-    """Return how fast one side is beside another in per cent: over all blocks, and the quartiles of the blocks."""
-    each = np.quantile(100 * took[:, other] / took[:, ours], (0.25, 0.75))
+    """Return how fast one side is beside another in per cent: over all blocks, and the median and quartiles of the blocks."""
+    low, median, high = np.quantile(100 * took[:, other] / took[:, ours], (0.25, 0.5, 0.75))
     whole = 100 * took[:, other].sum() / took[:, ours].sum()
-    return f"{whole:.0f} % (quarter of the blocks below {each[0]:.0f}, above {each[1]:.0f})"
+    return f"{whole:.0f} %; of a block {median:.0f} ({low:.0f} to {high:.0f})"

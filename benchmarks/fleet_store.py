@@ -194,7 +194,8 @@ def main() -> None:
         measure_retention(database, server, tell)
         database.close()
     note = (
-        f"Ingest: {INGEST_TWINS} twins, blocks of up to {4 * SHARE} batches on each side in turn, the first not counted; "
+        f"Ingest: {INGEST_TWINS} twins, blocks of up to {4 * SHARE} batches on each side in turn, the first not counted: "
+        "the ratio of all of them, and of a block the median and the quartiles; "
         f"both sides commit as durably, up to {SHARE} batches each. "
         f"Reads and retention: {TWINS * DAYS:,} segments of {ROWS_A_DAY} samples in 16 quarters, by the store's statements. "
         "A quarter is dropped once no twin keeps anything of it, under a lock on the whole table that is given up after a "
