@@ -96,7 +96,7 @@ def forecasts(client: TwinClient, count: int) -> Rows:
     client.ingest("chain", *orbits(600))
     job = client.wait("chain", client.calibrate("chain"))
     assert job.state == "succeeded", job.message
-    client.residuals("chain")
+    client.all_residuals("chain")
     for _ in range(10):
         client.forecast("chain", N_ORBITS * ORBIT_S, step_s=STEP_S)
     median, last = spread_ms(timed(lambda: client.forecast("chain", N_ORBITS * ORBIT_S, step_s=STEP_S), count))

@@ -168,12 +168,67 @@ def vast(url: str) -> Row:
     return ["a vast specification", "; ".join(figures), "no stall of seconds"]
 
 
-class _Told(list[Row]):
-    """Rows that are printed as they come."""
+def ingested(url: str, count: int) -> Row:
+    """Measure how long so many frames take."""
+    begun_s = time.perf_counter()
+    post_all(url, "/v1/twins/chain/telemetry", list(frames(count)), [])
+    return [f"ingest of {count:,} frames of {N_NODES + 1} channels", f"{time.perf_counter() - begun_s:.0f} s", ""]
 
-    def append(self, row: Row) -> None:
-        print(" | ".join(row), flush=True)
-        super().append(row)
+
+def after_activation(client: TwinClient) -> Iterator[Row]:
+    """Measure when a model that has just become active forecasts, and when it has seen its window of the archive."""
+    begun_s = time.perf_counter()
+    ahead = client.forecast("chain", 3600.0, step_s=60.0)
+    figures = f"{time.perf_counter() - begun_s:.1f} s, {ahead.behind_s:.0f} s behind"
+    yield ["first forecast after the activation", figures, "seconds"]
+    while client.twin("chain").catching_up:
+        time.sleep(0.5)
+    yield ["the window of the archive assimilated", f"{time.perf_counter() - begun_s:.0f} s", ""]
+
+
+def on_disk(path: Path) -> Row:
+    """Measure what samples and residuals take."""
+    lengths = {"chunk": "length(seq) + length(time) + length(value) + length(received)"}
+    lengths["residual"] = "length(seq) + length(time) + length(value)"
+    whole = {table: size_MB(path, f"SELECT sum({sizes}) FROM {table}") for table, sizes in lengths.items()}
+    each = {
+        table: size_MB(path, f"SELECT 1e6 * sum({sizes}) / sum(n) FROM {table}") for table, sizes in lengths.items()
+    }
+    figures = ", ".join(f"{whole[table]:.0f} MB ({each[table]:.0f} B a frame)" for table in lengths)
+    return ["archive and residuals on disk", figures, "residuals ≤ archive"]
+
+
+def deleted(url: str, client: TwinClient, path: Path, count: int) -> Row:
+    """Measure the deletion of the large twin, and what others notice of it."""
+    with stalls(url) as latencies_s:
+        begun_s = time.perf_counter()
+        client.delete("chain")
+        took_s = time.perf_counter() - begun_s
+        while size_MB(path, "SELECT 1e6 * count(*) FROM chunk") > 0:
+            time.sleep(0.2)
+        gone_s = time.perf_counter() - begun_s
+    stall_ms = 1e3 * max(latencies_s)
+    figures = f"{1e3 * took_s:.0f} ms, gone after {gone_s:.0f} s, longest stall of others {stall_ms:.0f} ms"
+    return [f"deletion of the twin of {count:,} frames", figures, "nobody stalls"]
+
+
+def questions(url: str, folder: Path, count: int, with_diagnosis: bool) -> Iterator[Row]:
+    """Yield the rows of the table, one question after the other."""
+    path = folder / "bench.sqlite3"
+    with TwinClient(url, timeout_s=300.0) as client:
+        client.register(chain("chain"))
+        yield ingested(url, count)
+        yield job(client, folder, "calibration", "≤ 60 s")
+        yield from after_activation(client)
+        yield job(client, folder, "calibration", "", thin=True, activate=False)
+        if with_diagnosis:
+            yield job(client, folder, "diagnosis", "≤ 300 s, ≤ 1 GB")
+        yield on_disk(path)
+        yield from answers(url, folder)
+        yield from wide(url, folder)
+        yield vast(url)
+        client.delete("wide")
+        yield deleted(url, client, path, count)
 
 
 def main() -> None:
@@ -185,68 +240,18 @@ def main() -> None:
         "--only-wide", action="store_true", help="only calibrate the two hundred channels; writes no table"
     )
     given = parser.parse_args()
-    count = given.frames
-    load = os.getloadavg()[0]
-    rows = _Told()
+    load, rows = os.getloadavg()[0], []
+    with tempfile.TemporaryDirectory() as name, running(["-m", "service"], Path(name)) as url:
+        asked = (
+            wide(url, Path(name))
+            if given.only_wide
+            else questions(url, Path(name), given.frames, not given.without_diagnosis)
+        )
+        for row in asked:
+            print(" | ".join(row), flush=True)
+            rows.append(row)
     if given.only_wide:
-        with tempfile.TemporaryDirectory() as name, running(["-m", "service"], Path(name)) as url:
-            for row in wide(url, Path(name)):
-                rows.append(row)
         return
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        path = folder / "bench.sqlite3"
-        with running(["-m", "service"], folder) as url, TwinClient(url, timeout_s=300.0) as client:
-            client.register(chain("chain"))
-            begun_s = time.perf_counter()
-            post_all(url, "/v1/twins/chain/telemetry", list(frames(count)), [])
-            rows.append(
-                [f"ingest of {count:,} frames of {N_NODES + 1} channels", f"{time.perf_counter() - begun_s:.0f} s", ""]
-            )
-            rows.append(job(client, folder, "calibration", "≤ 60 s"))
-            begun_s = time.perf_counter()
-            ahead = client.forecast("chain", 3600.0, step_s=60.0)
-            rows.append(
-                [
-                    "first forecast after the activation",
-                    f"{time.perf_counter() - begun_s:.1f} s, {ahead.behind_s:.0f} s behind",
-                    "seconds",
-                ]
-            )
-            while client.twin("chain").catching_up:
-                time.sleep(0.5)
-            rows.append(["the window of the archive assimilated", f"{time.perf_counter() - begun_s:.0f} s", ""])
-            rows.append(job(client, folder, "calibration", "", thin=True, activate=False))
-            if not given.without_diagnosis:
-                rows.append(job(client, folder, "diagnosis", "≤ 300 s, ≤ 1 GB"))
-            archive = size_MB(
-                path, "SELECT sum(length(seq) + length(time) + length(value) + length(received)) FROM chunk"
-            )
-            residuals = size_MB(path, "SELECT sum(length(seq) + length(time) + length(value)) FROM residual")
-            per = size_MB(path, "SELECT 1e6 * sum(length(seq) + length(time) + length(value)) / sum(n) FROM residual")
-            each = size_MB(
-                path,
-                "SELECT 1e6 * sum(length(seq) + length(time) + length(value) + length(received)) / sum(n) FROM chunk",
-            )
-            rows.append(
-                [
-                    "archive and residuals on disk",
-                    f"{archive:.0f} MB ({each:.0f} B a frame), {residuals:.0f} MB ({per:.0f} B a frame)",
-                    "residuals ≤ archive",
-                ]
-            )
-            for row in (*answers(url, folder), *wide(url, folder)):
-                rows.append(row)
-            rows.append(vast(url))
-            with stalls(url) as latencies_s:
-                begun_s = time.perf_counter()
-                client.delete("chain")
-                took_s = time.perf_counter() - begun_s
-                while size_MB(path, "SELECT 1e6 * count(*) FROM chunk") > 0:
-                    time.sleep(0.2)
-                gone_s = time.perf_counter() - begun_s
-            figures = f"{1e3 * took_s:.0f} ms, gone after {gone_s:.0f} s, longest stall of others {1e3 * max(latencies_s):.0f} ms"
-            rows.append([f"deletion of the twin of {count:,} frames", figures, "nobody stalls"])
     table = markdown_table(["what", "measured", "wanted"], rows)
     note = f"Load of the machine before and after: {load:.1f} and {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     save_table("service_years", "A large archive", table, "benchmarks.service_years", note)

@@ -23,6 +23,9 @@ T = TypeVar("T", bound=BaseModel)
 
 STREAM_TIMEOUT = httpx.Timeout(30.0, read=60.0)
 """A live stream says something every 15 s, so a minute of silence means that it is dead."""
+COMPLETE_S, LOOK_S = 600.0, 0.5
+"""How long residuals of a whole archive are waited for, and how often they are asked for meanwhile."""
+
 RETRIED = frozenset({408, 429, 502, 503, 504})
 
 
@@ -250,6 +253,13 @@ class TwinClient:
     def residuals(self, name: str, **parameters: str | int | float | None) -> schemas.Residuals:
         """Return innovations and NIS between ``start`` and ``stop``."""
         return self.send(calls.residuals(name, parameters))
+
+    def all_residuals(self, name: str, **parameters: str | int | float | None) -> schemas.Residuals:
+        """Return the same once every stored sample is compared with the active model, or after ``COMPLETE_S`` what there is."""
+        until_s = time.monotonic() + COMPLETE_S
+        while not (found := self.residuals(name, **parameters)).complete and time.monotonic() < until_s:
+            self._sleep_s(LOOK_S)
+        return found
 
     def anomalies(self, name: str, **parameters: str | int | float | None) -> list[schemas.Anomaly]:
         """Return anomalies between ``start`` and ``stop``."""

@@ -157,7 +157,7 @@ def _finish(client: TwinClient, twin: str, job: Job, title: str) -> Job:
 def _misfit(client: TwinClient, twin: str, version: int) -> dict[str, Any]:
     """Return how badly the calibrated declared model fits: per sensor its noise, one-step and open-loop residuals."""
     document = client.model(twin, version).model_dump()["model"]
-    residuals = client.residuals(twin)
+    residuals = client.all_residuals(twin)
     innovations = {name: np.array(column, dtype=np.float64) for name, column in residuals.residual_K.items()}
     return {
         "noise_K": document["noise_K"],

@@ -88,6 +88,9 @@ class Residuals(Answer):
     )
     samples: int = Field(default=0, description="How many residuals there are in this span.")
     downsampled: bool = False
+    complete: bool = Field(
+        default=True, description="Whether every sample that was stored when this was asked is compared with its model."
+    )
 
 
 class Anomaly(Answer):

@@ -62,14 +62,14 @@ class Browser:
 
     def _end(self) -> None:
         self._process.terminate()
-        self._process.wait(20)
+        self._process.wait(60)
 
     def _find_page(self) -> str:
         note = self._folder / "DevToolsActivePort"
-        for _ in range(200):
+        for _ in range(600):
             with contextlib.suppress(OSError, ValueError, LookupError, httpx.TransportError, StopIteration):
                 port = int(note.read_text().splitlines()[0])
-                pages = httpx.get(f"http://127.0.0.1:{port}/json", trust_env=False).json()
+                pages = httpx.get(f"http://127.0.0.1:{port}/json", trust_env=False, timeout=60.0).json()
                 page = next(item for item in pages if item["type"] == "page")
                 return str(page["webSocketDebuggerUrl"])
             time.sleep(0.1)
@@ -80,7 +80,7 @@ class Browser:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
-            message = json.loads(self._socket.recv(timeout=30))
+            message = json.loads(self._socket.recv(timeout=60))
             if message.get("id") == self._number:
                 assert "error" not in message, message
                 return message["result"]

@@ -55,7 +55,7 @@ class Server:
 
     def client(self, key: str | None = None) -> TwinClient:
         """Return a client that gives up at once, so that a test sees what happens; it is closed with the server."""
-        client = TwinClient(self.url, key, retry=Retry(attempts=1))
+        client = TwinClient(self.url, key, retry=Retry(attempts=1), timeout_s=120.0)  # a busy machine takes its time
         self._clients.append(client)
         return client
 
@@ -70,7 +70,7 @@ class Server:
         return self._wait()
 
     def _wait(self) -> int:
-        status = self.process.wait(30)
+        status = self.process.wait(60)
         assert self.process.stdout is not None
         self.process.stdout.close()
         return status

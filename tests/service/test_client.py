@@ -51,6 +51,16 @@ def test_a_call_that_may_have_worked_is_not_repeated() -> None:
     assert seen == ["POST /v1/twins/t/calibrations"]
 
 
+def test_all_residuals_are_asked_for_until_they_are_complete() -> None:
+    seen: list[str] = []
+    answers = [
+        {"time": [], "residual_K": {}, "nis": [], "model_version": [], "complete": done} for done in (False, True)
+    ]
+    with make_client([httpx.Response(200, json=answer) for answer in answers], seen, []) as client:
+        assert client.all_residuals("t").complete
+    assert len(seen) == 2
+
+
 def test_refusals_are_not_repeated_and_name_the_field() -> None:
     problem = {"detail": "time[0]: bad", "errors": [{"field": "time[0]", "detail": "bad"}]}
     seen: list[str] = []

@@ -112,5 +112,5 @@ def test_a_fleet_of_a_thousand(server: Server, tmp_path: Path) -> None:
         page.until("document.documentElement.scrollWidth <= 390")
         assert page.troubles == []
 
-    answer = httpx.get(f"{server.url}/v1/fleet", timeout=10.0, trust_env=False)  # of a thousand only fifty travel
+    answer = httpx.get(f"{server.url}/v1/fleet", timeout=60.0, trust_env=False)  # of a thousand only fifty travel
     assert len(answer.json()["twins"]) == 50 and len(answer.content) < 40_000

@@ -125,7 +125,7 @@ def test_a_kill_during_activation_leaves_one_whole_model_active(tmp_path: Path) 
             assert client.twin("benchsat").active_model == active[0]
             log = client._http.get("/v1/twins/benchsat/models").json()["activations"]
             assert log[0]["version"] == active[0]
-            assert set(client.residuals("benchsat").model_version) == {active[0]}
+            assert set(client.all_residuals("benchsat").model_version) == {active[0]}
 
 
 def test_a_worker_that_is_killed_is_replaced(tmp_path: Path) -> None:
@@ -137,11 +137,11 @@ def test_a_worker_that_is_killed_is_replaced(tmp_path: Path) -> None:
             "benchsat", [60.0 * k for k in rows], {"T_px": [290.0 + k % 7 for k in rows], "Q_px": [0.5] * 200}
         )
         assert client.wait("benchsat", client.calibrate("benchsat")).state == "succeeded"
-        assert len(client.residuals("benchsat").time) == 200
+        assert len(client.all_residuals("benchsat").time) == 200
         for worker in _children(server.process.pid):
             os.kill(worker, signal.SIGKILL)
         client.ingest("benchsat", [60.0 * 200], {"T_px": [291.0]})
-        assert len(client.residuals("benchsat").time) == 201
+        assert len(client.all_residuals("benchsat").time) == 201
         assert client.forecast("benchsat", 600.0, step_s=60.0).model_version == 1
         assert "another one takes over" in server.log()
 
@@ -181,7 +181,7 @@ def test_second_server_on_one_database_is_refused(tmp_path: Path, link: str | No
             path = other
         environment = {**os.environ, "TWIN_PORT": "0", "TWIN_DATABASE_URL": f"sqlite:///{path}"}
         second = subprocess.run(
-            [sys.executable, "-m", "service"], env=environment, capture_output=True, text=True, timeout=30, check=False
+            [sys.executable, "-m", "service"], env=environment, capture_output=True, text=True, timeout=120, check=False
         )
         assert second.returncode == 2
         assert "another server uses this database" in second.stderr

@@ -83,7 +83,7 @@ def test_parameters_come_out(server: Server) -> None:
 
 
 def test_residuals_of_a_right_model_are_noise(server: Server) -> None:
-    residuals = server.client().residuals("pair")
+    residuals = server.client().all_residuals("pair")
     assert len(residuals.time) >= N_TRAIN
     for name in ("T_a", "T_b"):
         column = np.array(residuals.residual_K[name][20:], dtype=float)
@@ -151,8 +151,8 @@ def test_late_samples_end_in_the_same_state_as_samples_in_order(server: Server, 
         client.activate(twin, 1)
         for rows in order:
             send(client, rows, twin)
-            client.residuals(twin)
-        found = client.residuals(twin)
+            client.all_residuals(twin)
+        found = client.all_residuals(twin)
         assert len(found.time) == 204
         ends[twin] = np.array([found.residual_K["T_a"][-3:], found.residual_K["T_b"][-3:]])
     np.testing.assert_allclose(ends["late"], ends["ordered"], atol=1e-6)
@@ -170,7 +170,7 @@ def test_records_far_apart_end_the_same_in_any_order(server: Server) -> None:
         client.activate(twin, 1)
         for rows, after_s in order:
             send(client, rows, twin, after_s)
-            found[twin] = client.residuals(twin)
+            found[twin] = client.all_residuals(twin)
     onward, backward = found["onward"], found["backward"]
     assert onward.time == backward.time and len(onward.time) == 200
     for sensor in ("T_a", "T_b"):
@@ -182,12 +182,12 @@ def test_records_far_apart_end_the_same_in_any_order(server: Server) -> None:
 
 
 def test_restart_goes_on_from_the_checkpoint(server: Server) -> None:
-    before = server.client().residuals("pair")
+    before = server.client().all_residuals("pair")
     server.stop()
     server.start()
     client = server.client()
     send(client, [N_TRAIN])
-    after = client.residuals("pair")
+    after = client.all_residuals("pair")
     assert after.residual_K["T_a"][: len(before.time)] == before.residual_K["T_a"]
     assert len(after.time) == len(before.time) + 1
     assert abs(after.residual_K["T_a"][-1] or 9.9) < 6.0 * NOISE_K

@@ -18,6 +18,7 @@ from tests.service.server import Server
 pytestmark = pytest.mark.e2e
 
 LATER = b"<later>"
+PATIENCE_S = 60.0
 ROUTE = "/v1/twins/benchsat/telemetry"
 
 
@@ -30,7 +31,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 def dial(server: Server) -> socket.socket:
     parts = urlsplit(server.url)
-    return socket.create_connection((parts.hostname, parts.port), timeout=20)
+    return socket.create_connection((parts.hostname, parts.port), timeout=PATIENCE_S)
 
 
 def read_to_end(connection: socket.socket) -> bytes:
@@ -94,7 +95,7 @@ def test_what_is_no_http_is_told_so_as_any_other_problem(server: Server, head: b
 
 def test_large_bodies_are_refused_with_an_answer(server: Server) -> None:
     parts = urlsplit(server.url)
-    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=60)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port, timeout=PATIENCE_S)
     connection.request("POST", ROUTE, b" " * 64 * 1024 * 1024, {"Content-Type": "application/json"})
     response = connection.getresponse()
     assert response.status == 413
@@ -160,7 +161,7 @@ def test_a_caller_that_hangs_up_in_the_middle(server: Server) -> None:
     "path", ["/", "/healthz", "/readyz", "/metrics", "/docs", "/assets/style.css", "/v1/twins", ROUTE, "/nowhere"]
 )
 def test_head_is_get_without_its_body(server: Server, path: str) -> None:
-    with httpx.Client(base_url=server.url) as client:
+    with httpx.Client(base_url=server.url, timeout=PATIENCE_S) as client:
         asked, told = client.head(path), client.get(path)
     assert (asked.status_code, asked.content) == (told.status_code, b"")
     differing = {"date", "content-length"} if path == "/metrics" else {"date"}
@@ -170,10 +171,10 @@ def test_head_is_get_without_its_body(server: Server, path: str) -> None:
 
 
 def test_head_of_a_stream_ends(server: Server) -> None:
-    answer = httpx.head(f"{server.url}/v1/twins/benchsat/events", timeout=5)
+    answer = httpx.head(f"{server.url}/v1/twins/benchsat/events", timeout=PATIENCE_S)
     assert (answer.status_code, answer.headers["content-type"]) == (200, "text/event-stream; charset=utf-8")
-    until(lambda: "twin_stream_readers 0.0" in httpx.get(f"{server.url}/metrics").text)
+    until(lambda: "twin_stream_readers 0.0" in httpx.get(f"{server.url}/metrics", timeout=PATIENCE_S).text)
 
 
 def test_head_is_no_way_to_post(server: Server) -> None:
-    assert httpx.head(f"{server.url}/v1/twins/benchsat/models/1/activate").status_code == 405
+    assert httpx.head(f"{server.url}/v1/twins/benchsat/models/1/activate", timeout=PATIENCE_S).status_code == 405

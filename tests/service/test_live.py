@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.live import forecasts
 from service.stream import past
 from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC, Sql
@@ -500,8 +501,12 @@ def test_a_twin_says_while_it_catches_up(make_client, tmp_path: Path, monkeypatc
     calibrate(client)
     while client.get(TWIN).json()["catching_up"] is not True:
         time.sleep(0.02)
+    with monkeypatch.context() as impatient:
+        impatient.setattr(forecasts, "SETTLE_S", 0.1)
+        found = client.get(f"{TWIN}/residuals").json()
+        assert found["time"] == [] and found["complete"] is False
     (tmp_path / "gate").touch()
-    assert len(residuals(client)) == 100
+    assert len(residuals(client)) == 100 and client.get(f"{TWIN}/residuals").json()["complete"] is True
     assert client.get(TWIN).json()["catching_up"] is False
     send(client, [100], [290.0])
     assert client.get(TWIN).json()["catching_up"] is False  # one sample is nothing to catch up with

@@ -14,6 +14,8 @@ from tests.service.server import Server
 
 pytestmark = pytest.mark.e2e
 
+PATIENCE_S = 60.0
+
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
@@ -43,7 +45,7 @@ def test_socket_tells_each_sample_in_order(server: Server, twin: str) -> None:
     with connect(socket_url(server, twin)) as socket:
         send(server, twin, 1, 2)
         send(server, twin, 0.5)
-        messages = [json.loads(socket.recv(timeout=10)) for _ in range(3)]
+        messages = [json.loads(socket.recv(timeout=PATIENCE_S)) for _ in range(3)]
     assert [m["seq"] for m in messages] == [1, 2, 3]
     assert messages[0] == {"type": "sample", "seq": 1, "time": "1970-01-01T00:00:01Z", "values": {"T_px": 291.0}}
     assert messages[2]["time"] == "1970-01-01T00:00:00.500000Z"
@@ -53,17 +55,19 @@ def test_duplicates_are_no_news(server: Server, twin: str) -> None:
     send(server, twin, 1)
     send(server, twin, 1, 2)
     with connect(socket_url(server, twin, "?after_seq=0")) as socket:
-        assert [json.loads(socket.recv(timeout=10))["values"]["T_px"] for _ in range(2)] == [291.0, 292.0]
+        assert [json.loads(socket.recv(timeout=PATIENCE_S))["values"]["T_px"] for _ in range(2)] == [291.0, 292.0]
 
 
 def test_resumption_over_both_transports(server: Server, twin: str) -> None:
     send(server, twin, *range(10))
     with connect(socket_url(server, twin, "?after_seq=7")) as socket:
-        assert [json.loads(socket.recv(timeout=10))["seq"] for _ in range(3)] == [8, 9, 10]
+        assert [json.loads(socket.recv(timeout=PATIENCE_S))["seq"] for _ in range(3)] == [8, 9, 10]
     with server.client() as client:
         assert next(iter(client.events(twin, after_seq=9))).seq == 10
     headers = {"Last-Event-ID": "8"}
-    with httpx.stream("GET", f"{server.url}/v1/twins/{twin}/events?after_seq=0", headers=headers) as response:
+    with httpx.stream(
+        "GET", f"{server.url}/v1/twins/{twin}/events?after_seq=0", headers=headers, timeout=PATIENCE_S
+    ) as response:
         assert response.headers["content-type"].startswith("text/event-stream")
         lines = [line for line, _ in zip(response.iter_lines(), range(6), strict=False)]
     assert "id: 9" in lines and "id: 10" in lines and "id: 8" not in lines
@@ -72,10 +76,10 @@ def test_resumption_over_both_transports(server: Server, twin: str) -> None:
 def test_a_reader_that_lags_too_far_is_told_what_it_missed(server: Server, twin: str) -> None:
     send(server, twin, *range(300))
     with connect(socket_url(server, twin, "?after_seq=5")) as socket:
-        first = json.loads(socket.recv(timeout=10))
+        first = json.loads(socket.recv(timeout=PATIENCE_S))
         assert (first["type"], first["first_seq"], first["last_seq"], first["count"]) == ("dropped", 6, 200, 195)
         assert first["seq"] == 200
-        assert [json.loads(socket.recv(timeout=10))["seq"] for _ in range(100)] == list(range(201, 301))
+        assert [json.loads(socket.recv(timeout=PATIENCE_S))["seq"] for _ in range(100)] == list(range(201, 301))
 
 
 def test_a_batch_larger_than_what_is_kept_in_memory_reaches_its_readers(tmp_path: Path) -> None:
@@ -85,10 +89,10 @@ def test_a_batch_larger_than_what_is_kept_in_memory_reaches_its_readers(tmp_path
         with connect(socket_url(server, "benchsat")) as live:
             for start in (0, 5000):
                 send(server, "benchsat", *range(start, start + 5000))
-            assert [json.loads(live.recv(timeout=10))["seq"] for _ in range(10_000)] == list(range(1, 10_001))
+            assert [json.loads(live.recv(timeout=PATIENCE_S))["seq"] for _ in range(10_000)] == list(range(1, 10_001))
         for _ in range(2):
             with connect(socket_url(server, "benchsat", "?after_seq=7")) as late:
-                assert [json.loads(late.recv(timeout=10))["seq"] for _ in range(9993)] == list(range(8, 10_001))
+                assert [json.loads(late.recv(timeout=PATIENCE_S))["seq"] for _ in range(9993)] == list(range(8, 10_001))
             server.stop()
             server.start()
 
@@ -99,10 +103,10 @@ def test_a_reader_that_does_not_read_slows_nobody(server: Server, twin: str) -> 
             send(server, twin, *range(start, start + 5000))
         seen = 0
         while seen < 100_000:
-            seen = json.loads(eager.recv(timeout=10))["seq"]
+            seen = json.loads(eager.recv(timeout=PATIENCE_S))["seq"]
         position, missed = 0, 0
         while position < 100_000:
-            message = json.loads(lazy.recv(timeout=10))
+            message = json.loads(lazy.recv(timeout=PATIENCE_S))
             if message["type"] == "dropped":
                 assert message["first_seq"] == position + 1
                 missed += message["count"]
@@ -121,7 +125,7 @@ def test_numbers_go_on_after_a_restart(tmp_path: Path) -> None:
         server.start()
         send(server, "benchsat", 4)
         with connect(socket_url(server, "benchsat", "?after_seq=1")) as socket:
-            assert [json.loads(socket.recv(timeout=10))["seq"] for _ in range(3)] == [2, 3, 4]
+            assert [json.loads(socket.recv(timeout=PATIENCE_S))["seq"] for _ in range(3)] == [2, 3, 4]
 
 
 def test_streams_end_with_their_twin_and_with_the_server(tmp_path: Path) -> None:
@@ -131,10 +135,10 @@ def test_streams_end_with_their_twin_and_with_the_server(tmp_path: Path) -> None
         with connect(socket_url(server, "benchsat")) as first, connect(socket_url(server, "other")) as second:
             client.delete("benchsat")
             with pytest.raises(ConnectionClosed):
-                first.recv(timeout=10)
+                first.recv(timeout=PATIENCE_S)
             server.stop()
             with pytest.raises(ConnectionClosed):
-                second.recv(timeout=10)
+                second.recv(timeout=PATIENCE_S)
 
 
 def test_strangers_and_unknown_twins_are_refused(tmp_path: Path) -> None:

@@ -44,7 +44,10 @@ def limited(deadline: float, cpu_s: float = NO_DEADLINE) -> Iterator[None]:
 
 
 def check_time() -> None:
-    """Raise TimeIsUpError where the time that :func:`limited` leaves is over; iterations call it once each."""
+    """Raise TimeIsUpError where the time that :func:`limited` leaves is over.
+
+    Iterations call it once each, and so does each segment and each stretch of an evaluation, which may be long.
+    """
     if is_late(_limit.get()) or time.thread_time() >= _cpu_limit.get():
         raise TimeIsUpError("the time is up")
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
+from twin_core.calibrate.containment import check_time
 from twin_core.errors import TelemetryError
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.model import Network
@@ -185,12 +186,16 @@ class Problem:
         return self.network.parameters.to_values(unknowns[: self.n_free])
 
     def solve(self, unknowns: FloatArray, near: Fit | None = None) -> Fit:
-        """Roll all segments out; ``near`` is the fit from which Newton's method starts."""
+        """Roll all segments out; ``near`` is the fit from which Newton's method starts.
+
+        Like :meth:`normal_equations` it raises TimeIsUpError where the time of ``containment.limited`` is over.
+        """
         values = self.values(unknowns)
         mean, std = self.prior()
         cost = 0.5 * float(np.sum(((unknowns - mean) / std) ** 2))
         trajectories, predicted = [], []
         for i, segment in enumerate(self.segments):
+            check_time()
             guess = None if near is None else near.trajectories[i].stages_K
             path = rollout(self.network, values, unknowns[self.start_columns(i)], segment.forcing, near=guess)
             trajectories.append(path)
@@ -280,6 +285,7 @@ class Problem:
         gradient = (unknowns - mean) / std**2
         residuals = self.residuals(fit)
         for i, samples, block in self.jacobian_stretches(unknowns, fit):
+            check_time()  # one evaluation over a long record takes seconds
             residual = residuals[i][samples]
             valid = np.isfinite(residual)
             scaled = np.where(valid, residual, 0.0) / self.noise_K

@@ -85,7 +85,7 @@ async def list_residuals(
     if version is not None:
         await service.database.read(models.get, twin.key, version)
     tracker = service.live.state(twin)
-    await tracker.settled(forecasts.SETTLE_S)
+    complete = await tracker.settled(forecasts.SETTLE_S)
     chosen = version or (tracker.active.version if tracker.active is not None else 0)
     n_sensors = len(twin.sensors)
     found, count = await service.database.read(
@@ -97,7 +97,7 @@ async def list_residuals(
         if predicted and count:
             n, span_us = len(twin.channels), (int(found.time_us[0]), int(found.time_us[-1]) + 1)
             raw = await service.database.read(samples.select, twin.key, n, range(n), *span_us)
-    document = await asyncio.to_thread(_render, twin, found, count, max_points, masked, raw)
+    document = await asyncio.to_thread(_render, twin, found, count, max_points, masked, raw, complete)
     return Response(document, media_type="application/json")
 
 
@@ -114,7 +114,13 @@ async def _masked(service: Service, twin: Entry, found: Found) -> Spans:
 
 
 def _render(
-    twin: Entry, found: Found, count: int, max_points: int, masked: Spans | None, raw: samples.Samples | None
+    twin: Entry,
+    found: Found,
+    count: int,
+    max_points: int,
+    masked: Spans | None,
+    raw: samples.Samples | None,
+    complete: bool,
 ) -> bytes:
     kept = extremes(np.vstack([found.innovation_K, found.nis[None, :]]), max_points)
 
@@ -130,6 +136,7 @@ def _render(
         "masked": masked,
         "samples": count,
         "downsampled": kept.size < count,
+        "complete": complete,
     }
     if raw is not None:
         document["predicted"] = _predicted(twin, found, kept, raw)

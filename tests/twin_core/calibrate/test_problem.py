@@ -1,11 +1,13 @@
 """What is fitted to what: cost, gradient and Hessian against numerical differentiation of the cost itself."""
 
 from dataclasses import replace
+from itertools import count
 
 import numpy as np
 import pytest
 
 from tests.helpers import active_effect, central_difference, every_term_network
+from twin_core.calibrate.containment import TimeIsUpError, limited
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.effects import REGISTRY
@@ -105,6 +107,20 @@ def test_no_solution_is_a_status() -> None:
     optimum = minimise(build_problem(p.network, [cold], p.noise_K, 100.0))
     assert optimum.status == "no_solution"
     assert optimum.iterations == 0
+
+
+def test_one_evaluation_ends_between_its_segments_when_the_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    p = problem()
+    x = p.start()
+    fit = p.solve(x)
+    assert len(p.segments) == 2
+    for evaluate in (lambda: p.solve(x), lambda: p.normal_equations(x, fit)):
+        clock = count()
+        monkeypatch.setattr("time.thread_time", lambda clock=clock: float(next(clock)))
+        with pytest.raises(TimeIsUpError), limited(np.inf, 2.0):
+            evaluate()
+        assert next(clock) == 3  # asked when the limit was set, and once a segment
+        evaluate()
 
 
 def test_excluded_intervals_are_half_open() -> None:
