@@ -15,109 +15,31 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import psycopg
 
+from benchmarks.fleet_ingest import (
+    CHANNELS,
+    SHARE,
+    copied_and_merged,
+    in_turn,
+    share_of,
+    specification,
+    through_the_store,
+)
 from benchmarks.markdown import markdown_table, save_table
-from service.store import appending, jobs, ownership, segments, twins
-from service.store.batch import Batch
+from service.store import jobs, ownership, twins
 from service.store.connection import Connection
 from service.store.database import Database
 from tests.service.fleet.load import prepare
 from tests.service.postgres import fresh_database, own_server
 from tests.service.server import FAKE
 
-CHANNELS = 12
 ROWS = 200
+BLOCKS = 12
 LANES = 4
-BEGIN_US = 1_767_225_600_000_000
-"""Of the telemetry: 2026-01-01."""
-
-
-def specification(name: str) -> dict[str, Any]:
-    """Return a twin of a dozen sensors."""
-    names = [f"T_{k}" for k in range(CHANNELS)]
-    return {
-        "twin": name,
-        "channels": {channel: {"kind": "temperature", "unit": "K"} for channel in names},
-        "nodes": [{"id": f"n{k}", "sensor": channel} for k, channel in enumerate(names)],
-    }
-
-
-def batches(count: int, n_twins: int, rows: int = ROWS) -> list[tuple[int, Batch]]:
-    """Return batches as (twin, batch), in turn, each of so many new samples."""
-    generator = np.random.default_rng(0)
-    made = []
-    for number in range(count):
-        first = number // n_twins * rows
-        time_us = BEGIN_US + (first + np.arange(rows, dtype=np.int64)) * 1_000_000
-        made.append((1 + number % n_twins, Batch(time_us, generator.normal(290, 5, (CHANNELS, rows)), time_us)))
-    return made
-
-
-def through_the_store(url: str, work: Sequence[tuple[int, Batch]], n_twins: int) -> float:
-    """Return samples per second through the store, as the service writes them: shared commits, every batch acknowledged."""
-    database = Database(url)
-    for k in range(n_twins):
-        database.submit(twins.register, f"s{k}", specification(f"s{k}"))
-    database.submit(lambda c: None).result()
-    done, left, errors = threading.Event(), len(work), list[BaseException]()
-
-    def acknowledge(result: appending.Receipt, error: BaseException | None) -> None:
-        """Hear of one batch, in the thread that writes."""
-        nonlocal left
-        left -= 1
-        errors.extend([error] if error is not None else [])
-        if not left:
-            done.set()
-
-    begun = time.perf_counter()
-    for twin, batch in work:
-        database.submit_to(twin, acknowledge, appending.append, twin, batch)
-    done.wait()
-    assert not errors
-    elapsed_s = time.perf_counter() - begun
-    database.close()
-    return sum(batch.time_us.size for _, batch in work) / elapsed_s
-
-
-def copied_and_merged(url: str, work: Sequence[tuple[int, Batch]], n_twins: int) -> float:
-    """Return samples per second of COPY into a stage and one INSERT ... SELECT, as many batches a commit as the store.
-
-    It is less than the store does: heads do not move, numbers are not handed out, and only a whole batch is known again.
-    """
-    database = Database(url)
-    for k in range(n_twins):
-        database.submit(twins.register, f"r{k}", specification(f"r{k}")).result()
-    keys = database.engine.read(lambda c: [row[0] for row in c.execute("SELECT id FROM twin ORDER BY id").fetchall()])
-    database.submit(segments.make_room, [int(batch.time_us[0]) for _, batch in work]).result()
-    database.close()
-    with psycopg.connect(url, autocommit=True) as connection:
-        connection.execute(
-            """CREATE TEMPORARY TABLE stage (twin bigint, n integer, first_us bigint, last_us bigint, last_seq bigint,
-               seq bytea, time bytea, value bytea, received bytea) ON COMMIT DELETE ROWS"""
-        )
-        begun = time.perf_counter()
-        for start in range(0, len(work), 256):
-            with connection.transaction():
-                with connection.cursor().copy("COPY stage FROM STDIN (FORMAT BINARY)") as copy:
-                    copy.set_types(["int8", "int4", "int8", "int8", "int8", "bytea", "bytea", "bytea", "bytea"])
-                    for twin, batch in work[start : start + 256]:
-                        n = int(batch.time_us.size)
-                        seq = np.arange(n, dtype="<i8").tobytes()
-                        time_us = batch.time_us.tobytes()
-                        ends = int(batch.time_us[0]), int(batch.time_us[-1])
-                        row = (keys[twin - 1], n, *ends, n, seq, time_us, batch.values.tobytes(), time_us)
-                        copy.write_row(row)
-                connection.execute(
-                    """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time, value, received)
-                        SELECT stage.* FROM stage WHERE NOT EXISTS (SELECT 1 FROM chunk AS held WHERE held.twin = stage.twin
-                        AND held.first_us = stage.first_us AND held.last_us = stage.last_us)"""
-                )
-        return sum(batch.time_us.size for _, batch in work) / (time.perf_counter() - begun)
 
 
 def claims(url: str, count: int) -> tuple[float, float]:
@@ -273,11 +195,11 @@ def main() -> None:
         url = os.environ.get("TWIN_TEST_POSTGRES_URL") or stack.enter_context(own_server("fsync=on")).url
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         for n_twins in (50, 1000):
-            work = batches(3000, n_twins)
-            with fresh_database(url) as one, fresh_database(url) as other:
-                raw, ours = copied_and_merged(other, work, n_twins), through_the_store(one, work, n_twins)
+            with through_the_store(url, n_twins) as store, copied_and_merged(url, n_twins) as raw:
+                took = in_turn([store, raw], n_twins, ROWS, BLOCKS, SHARE)
+            ours, copied = ROWS * BLOCKS * SHARE / took.sum(axis=0)
             what = f"store, {n_twins} twins, batches of {ROWS} × {CHANNELS}"
-            tell(what, f"{ours:,.0f} samples/s", f"COPY and merge {raw:,.0f}", f"{100 * ours / raw:.0f} %")
+            tell(what, f"{ours:,.0f} samples/s", f"COPY and merge {copied:,.0f}", share_of(took, 0, 1))
         alone = 0.0
         for n_twins, count in ((50, 1), (50, 2), (50, 4), (1000, 2)):
             with fresh_database(url) as database:

@@ -8,15 +8,24 @@ what retention costs when it deletes segments and when it drops quarters. ``pyth
 import contextlib
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import psycopg
-from numpy.typing import NDArray
 
-from benchmarks.fleet import BEGIN_US, CHANNELS, batches, copied_and_merged, specification, through_the_store
+from benchmarks.fleet_ingest import (
+    BEGIN_US,
+    CHANNELS,
+    SHARE,
+    copied_and_merged,
+    in_turn,
+    one_by_one,
+    share_of,
+    specification,
+    through_the_store,
+)
 from benchmarks.markdown import markdown_table, save_table
-from service.store import appending, retention, segments, twins
+from service.store import retention, segments, twins
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.database import Database
@@ -26,35 +35,14 @@ from tests.service.postgres import fresh_database, own_server
 
 TWINS, DAYS, KEPT_DAYS, ROWS_A_DAY = 10, 1460, 730, 144
 DAY_US = 86_400_000_000
-SHAPES = ((200, 2000), (10, 8000), (1, 8000))
-"""Samples in a batch, batches."""
+INGEST_TWINS = 50
+SHAPES = ((200, 12, SHARE), (10, 40, 4 * SHARE), (1, 40, 4 * SHARE))
+"""Samples in a batch, blocks, batches in a block."""
 READS = 200
-ROUNDS = 3
 
 Server = psycopg.Connection[tuple[object, ...]]
 Tell = Callable[..., None]
 """Adds a row of cells to the table."""
-
-
-@contextlib.contextmanager
-def one_by_one() -> Iterator[None]:
-    """Let the store insert every batch by itself, as it does with large ones."""
-    usual, appending.STAGED_BYTES = appending.STAGED_BYTES, 0
-    yield
-    appending.STAGED_BYTES = usual
-
-
-def ingest(server_url: str, rows: int, count: int) -> NDArray[np.float64]:
-    """Return samples per second, (ROUNDS, 3): the store, its batches one by one, COPY and merge into the same table."""
-    work, rounds = batches(count, 50, rows), []
-    for _ in range(ROUNDS):
-        with contextlib.ExitStack() as stack:
-            first, second, third = (stack.enter_context(fresh_database(server_url)) for _ in range(3))
-            found = [through_the_store(first, work, 50)]
-            with one_by_one():
-                found.append(through_the_store(second, work, 50))
-            rounds.append([*found, copied_and_merged(third, work, 50)])
-    return np.array(rounds)
 
 
 def fill(database: Database, server: Server) -> None:
@@ -115,15 +103,16 @@ def count(server: Server) -> int:
 
 def measure_ingest(url: str, tell: Tell) -> None:
     """Measure small batches of many twins beside plain COPY and merge."""
-    for n, batches_each in SHAPES:
-        found = ingest(url, n, batches_each)
-        ours, alone, copied = np.median(found, axis=0)
-        ratios = np.sort(100 * found[:, 0] / found[:, 2])
+    for rows, blocks, block in SHAPES:
+        with contextlib.ExitStack() as stack:
+            made = [side(url, INGEST_TWINS) for side in (through_the_store, one_by_one, copied_and_merged)]
+            took = in_turn([stack.enter_context(side) for side in made], INGEST_TWINS, rows, blocks, block)
+        ours, alone, copied = rows * blocks * block / took.sum(axis=0)
         tell(
-            f"ingest, batches of {n} × {CHANNELS}",
+            f"ingest, batches of {rows} × {CHANNELS}",
             f"{ours:,.0f} samples/s; one by one {alone:,.0f}",
             f"COPY and INSERT … SELECT {copied:,.0f}",
-            f"{np.median(ratios):.0f} % ({ratios[0]:.0f} to {ratios[-1]:.0f})",
+            share_of(took, 0, 2),
         )
 
 
@@ -205,8 +194,9 @@ def main() -> None:
         measure_retention(database, server, tell)
         database.close()
     note = (
-        f"Ingest: 50 twins, medians of {ROUNDS} runs of each in turn, and the median, least and greatest of their ratios; "
-        "both sides commit as durably, up to 256 batches each. "
+        f"Ingest: {INGEST_TWINS} twins, blocks of up to {4 * SHARE} batches on each side in turn, the first not counted: "
+        "the ratio of all of them, and of a block the median and the quartiles; "
+        f"both sides commit as durably, up to {SHARE} batches each. "
         f"Reads and retention: {TWINS * DAYS:,} segments of {ROWS_A_DAY} samples in 16 quarters, by the store's statements. "
         "A quarter is dropped once no twin keeps anything of it, under a lock on the whole table that is given up after a "
         "second; what some twins keep is deleted one by one, beside which ingest goes on, and VACUUM clears up."

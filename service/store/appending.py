@@ -67,8 +67,9 @@ def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
         stage: Stage | None = getattr(connection, "stage", None)
         if stage is not None and 8 * (batch.values.size + 3 * n) < STAGED_BYTES:
             known = stage.head(twin)
-            if known is not None and (known.last_us is None or known.last_us < time_us[0]):
-                return _put(stage, known, twin, batch)
+            first_us = int(time_us[0])
+            if known is not None and (known.last_us is None or known.last_us < first_us):
+                return _put(stage, known, twin, batch, first_us)
         head = _advance(connection, twin, batch, n, after_all=True)
         if head is not None:
             _write(connection, twin, batch, head)
@@ -76,12 +77,13 @@ def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
     return _merge_in(connection, twin, batch)
 
 
-def _put(stage: Stage, head: Head, twin: int, batch: Batch) -> Receipt:
+def _put(stage: Stage, head: Head, twin: int, batch: Batch, first_us: int) -> Receipt:
     """Store a small batch that comes after everything that is stored, together with those of other twins."""
-    n, first_seq, first_us, last_us = batch.time_us.size, head.seq + 1, int(batch.time_us[0]), int(batch.time_us[-1])
+    n, first_seq = batch.time_us.size, head.seq + 1
+    last_us = first_us if n == 1 else int(batch.time_us[-1])
     head.seq, head.last_us, head.small_rows = head.seq + n, last_us, head.small_rows + n
     seq = np.arange(first_seq, head.seq + 1)
-    if quarter_of(first_us) == quarter_of(last_us):
+    if n == 1 or quarter_of(first_us) == quarter_of(last_us):
         stage.put(segments.packed(twin, (first_us, last_us, head.seq), seq, batch))
         head.small_chunks += 1
     else:

@@ -4,7 +4,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import nullcontext
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -107,10 +106,10 @@ class PostgresSession:
         """Begin a transaction and lock the heads of these twins."""
         if not self.in_transaction:
             self._connect()
-        with self._speaking.driver.pipeline() if twins else nullcontext():
+        if twins:
+            self._stage.begin(twins)
+        else:
             self._speaking.driver.execute("BEGIN")
-            if twins:
-                self._stage.begin(twins)
 
     def turn(self, twin: int | None) -> None:
         """Hear whose twin's the next statements are; None: they may concern any."""

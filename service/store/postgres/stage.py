@@ -1,7 +1,6 @@
 """Segments of many twins on their way into one table: COPY into a stage, then one INSERT … SELECT that moves the heads, too."""
 
 from collections.abc import Callable, Iterable
-from contextlib import nullcontext
 from itertools import chain
 from typing import Any
 
@@ -9,7 +8,7 @@ import psycopg
 
 from service.store.connection import Head, Row
 
-LOCK = """SELECT twin, seq, last_us, small_chunks, small_rows FROM head WHERE twin = ANY(%s) ORDER BY twin FOR UPDATE"""
+LOCK = """SELECT twin, seq, last_us, small_chunks, small_rows FROM head WHERE twin IN ({}) ORDER BY twin FOR UPDATE"""
 COLUMNS = {
     **dict.fromkeys(("twin", "n", "first_us", "last_us", "last_seq"), "int8"),
     **dict.fromkeys(("seq", "time", "value", "received"), "bytea"),
@@ -26,6 +25,11 @@ STORE = """WITH staged ({names}) AS ({source}),
                      RETURNING head.twin)
            INSERT INTO chunk ({names}) SELECT {names} FROM staged WHERE twin IN (SELECT twin FROM moved) ORDER BY last_seq"""
 """What a head has passed is in the archive and does not enter it again."""
+NAMES = ", ".join(COLUMNS)
+STORE_STAGED = f"""CREATE FUNCTION pg_temp.store_staged() RETURNS void LANGUAGE plpgsql AS
+                   $$BEGIN {STORE.format(names=NAMES, source=f"SELECT {NAMES} FROM stage")}; END$$"""
+"""A function keeps its plan while the connection lives, and travels with COMMIT as one message. What the driver prepares by
+itself needs its pipeline for that, which costs the client more than all rows of a commit."""
 Rooms = dict[str, tuple[int, int]]
 """Partitions and the instants, start <= first_us < stop, that they are for."""
 FEW = 4
@@ -38,7 +42,8 @@ class Stage:
     def __init__(self, driver: "psycopg.Connection[Any]", make: Callable[[Iterable[int]], Rooms]) -> None:
         """Hold nothing; ``make`` makes partitions for segments that begin at some instants, and tells which there are."""
         self._driver, self._make = driver, make
-        driver.execute(MAKE)
+        for statement in (MAKE, STORE_STAGED):
+            driver.execute(statement)  # type: ignore[arg-type]
         self.rooms: Rooms = {}
         self.due: dict[int, int] = {}
         self._heads: dict[int, Head] = {}
@@ -47,8 +52,8 @@ class Stage:
         self._is_used = False
 
     def begin(self, twins: Iterable[int]) -> None:
-        """Lock the heads of these twins, in one order everywhere so that nobody waits in a circle."""
-        found = self._driver.execute(LOCK, (sorted(twins),), binary=True)
+        """Begin a transaction and lock the heads of these twins, in one order everywhere so that nobody waits in a circle."""
+        found = self._together("BEGIN", LOCK.format(", ".join(map(str, twins))))
         self._heads = {twin: Head(*head) for twin, *head in found}
 
     def end(self) -> None:
@@ -66,7 +71,9 @@ class Stage:
 
     def make_room(self, instants: Iterable[int]) -> None:
         """Make the partitions that segments need which begin at some instants, as far as they are not known to be there."""
-        missing = [t for t in instants if not any(first <= t < stop for first, stop in self.rooms.values())]
+        missing = list(instants)
+        for first, stop in self.rooms.values():
+            missing = [t for t in missing if not first <= t < stop]
         if missing:
             self.rooms = self._make(missing)
             name = next(name for name, (first, stop) in self.rooms.items() if first <= missing[0] < stop)
@@ -92,21 +99,27 @@ class Stage:
     def flush(self, *after: str) -> None:
         """Store what waits, and run statements that follow in the same round trip."""
         rows, self._rows = self._rows, []
-        parameters: list[Any] = []
         if rows:
             self.make_room(row[2] for row in rows)
-            names = ", ".join(COLUMNS)
-            source = f"SELECT {names} FROM stage"
-            if len(rows) <= FEW:
-                place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"
-                source, parameters = f"VALUES {', '.join([place] * len(rows))}", list(chain(*rows))
-            else:
-                self._copy(rows)
-            after = (STORE.format(names=names, source=source), *after)
-        with self._driver.pipeline() if len(after) > 1 else nullcontext():
-            for statement in after:
-                self._driver.execute(statement, parameters)  # type: ignore[arg-type]
-                parameters = []
+        if 0 < len(rows) <= FEW:
+            place = f"({', '.join(f'%s::{kind}' for kind in COLUMNS.values())})"
+            store = STORE.format(names=NAMES, source=f"VALUES {', '.join([place] * len(rows))}")
+            with self._driver.pipeline():
+                self._driver.execute(store, list(chain(*rows)))  # type: ignore[arg-type]
+                for statement in after:
+                    self._driver.execute(statement)  # type: ignore[arg-type]
+        elif rows:
+            self._copy(rows)
+            self._together("SELECT pg_temp.store_staged()", *after)
+        elif after:
+            self._together(*after)
+
+    def _together(self, *statements: str) -> "psycopg.Cursor[Any]":
+        """Run statements in one round trip; return the last one's answer."""
+        cursor = self._driver.execute("; ".join(statements), prepare=False)  # type: ignore[arg-type]
+        while cursor.nextset():
+            pass
+        return cursor
 
     def _copy(self, rows: Iterable[Row]) -> None:
         """Let the stage hold segments, and nothing else."""
