@@ -362,7 +362,8 @@ class Validation:
     Attributes
     ----------
     ratio
-        Open-loop error after over before (rms).
+        Open-loop error after over before (rms), no less than where both were fitted: what a simpler model's parameters do where
+        the block that tells them is left out is nothing that an effect explains.
     blocks_better
         Share of blocks whose error fell.
     forward_ratio
@@ -392,12 +393,12 @@ class Validation:
 
         A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
         them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
-        their geometric mean counts, and once more what makes one of them worse.
+        their geometric mean counts, and twice more what makes one of them worse.
         """
         if self.n_sessions > 1 and self.is_law:
             is_told_by_all = 1.0 - self.forward_ratio >= policy.BETWEEN_SESSIONS * (1.0 - self.ratio)
             return self.forward_ratio if is_told_by_all else 1.0
-        return float(np.sqrt(self.ratio * self.forward_ratio)) * max(1.0, self.ratio, self.forward_ratio)
+        return float(np.sqrt(self.ratio * self.forward_ratio)) * max(1.0, self.ratio, self.forward_ratio) ** 2
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:
@@ -417,7 +418,9 @@ def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence
 def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
     before, after = simple.block_errors(), rich.block_errors()
-    ratio = float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
+    misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
+    where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
+    ratio = max(float(np.sqrt(after.sum() / max(before.sum(), 1e-300))), where_fitted)
     forward = float(np.sqrt(rich.forward_error() / max(simple.forward_error(), 1e-300)))
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)

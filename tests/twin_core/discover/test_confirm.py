@@ -129,3 +129,13 @@ def test_a_superfluous_effect_is_not_supported() -> None:
     evidence = weigh(base, try_effects(base, [useless], n_passes=12), 1)
     assert evidence.log_bayes_factor < 0.0
     assert evidence.p_value > 1e-3
+
+
+def test_a_simpler_model_that_runs_away_where_a_block_is_left_out_makes_an_effect_no_better(
+    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parameters that a single block tells are anything without it."""
+    base, right = trials
+    before, after = (np.nanmean(np.concatenate(trial.calibration().residuals) ** 2) for trial in trials)
+    monkeypatch.setattr(Trial, "block_errors", lambda own: np.full(N_BLOCKS, 1e9 if own is base else 1.0))
+    assert validate(base, right).ratio == pytest.approx(np.sqrt(after / before))
