@@ -215,20 +215,6 @@ def assert_nothing_lost(url: str, load: Load, fault: str, wait_s: float = 60.0) 
     found.assert_nothing_lost()
 
 
-def job_tally(url: str, jobs: Sequence[str], wait_s: float = 120.0) -> Tally:
-    """Wait until jobs have ended; tell how many did not succeed, and how many models they left beyond one each."""
-    end_s = time.monotonic() + wait_s
-    with psycopg.connect(url, autocommit=True) as connection:
-        while True:
-            rows = connection.execute("SELECT state, result FROM job WHERE id = ANY(%s)", (list(jobs),)).fetchall()
-            if all(state not in ("queued", "running") for state, _ in rows) or time.monotonic() > end_s:
-                break
-            time.sleep(0.2)
-        made = connection.execute("SELECT count(*) FROM model WHERE source <> 'manual'").fetchone()[0]  # type: ignore[index]
-    done = sum(state == "succeeded" for state, _ in rows)
-    return Tally(len(jobs), 0, jobs_lost=len(jobs) - done, jobs_twice=max(made - done, 0))
-
-
 def calibrations(service: Server, count: int) -> list[str]:
     """Queue calibrations of the first twin, which wait for the gate; return their ids."""
     twin = f"{service.url}/v1/twins/sat-0"
@@ -249,8 +235,7 @@ def assert_jobs_done_once(url: str, jobs: Sequence[str], fault: str, wait_s: flo
             if not {"queued", "running"} & set(states) or time.monotonic() > end_s:
                 break
             time.sleep(0.2)
-        query = "SELECT count(*) FROM model WHERE source = 'calibration'"
-        made = connection.execute(query).fetchone()[0]  # type: ignore[index]
+        made = connection.execute("SELECT count(*) FROM model WHERE source = 'calibration'").fetchone()[0]  # type: ignore[index]
     done = states.count("succeeded")
     found = Tally(len(jobs), 0, jobs_lost=len(jobs) - done, jobs_twice=max(made - done, 0))
     found.note(fault)
