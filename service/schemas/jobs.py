@@ -19,7 +19,9 @@ class _Selecting(Request):
 
     start: Time | None = None
     stop: Time | None = None
-    samples: Annotated[int, Field(ge=20)] | None = Field(default=None, description="absent: as TWIN_JOB_VALUES says")
+    samples: Annotated[int, Field(ge=20, le=1_000_000_000)] | None = Field(
+        default=None, description="absent: as TWIN_JOB_VALUES says"
+    )
     thin: bool = False
     deadline_s: Positive | None = Field(default=None, description="absent: as TWIN_JOB_SEARCH_S says")
 

@@ -112,6 +112,11 @@ class TwinList(Answer):
     twins: list[TwinGlance]
 
 
+Days = Annotated[Positive, Field(le=100_000)]
+"""Longer than from the first to the last instant that a sample may have."""
+Newest = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
 class RetentionRequest(Request):
     """How long what belongs to a twin is kept; null: for ever.
 
@@ -119,10 +124,10 @@ class RetentionRequest(Request):
     active model and its parent, and of jobs of each kind.
     """
 
-    samples_days: Positive | None = None
-    residuals_days: Positive | None = None
-    models: Annotated[int, Field(ge=0)] | None = None
-    jobs: Annotated[int, Field(ge=0)] | None = None
+    samples_days: Days | None = None
+    residuals_days: Days | None = None
+    models: Newest | None = None
+    jobs: Newest | None = None
 
 
 class Retention(Answer):

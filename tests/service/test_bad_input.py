@@ -184,6 +184,9 @@ ELSEWHERE = [
         path=FORECASTS,
     ),
     Case("calibration: text for a choice", {"activate": "yes"}, 422, "activate", path=f"{TWIN}/calibrations"),
+    Case("calibration: more than can be counted", {"samples": 10**30}, 422, "samples", path=f"{TWIN}/calibrations"),
+    Case("model: more than can be counted", {"spec": {}, "rmse_K": 10**30}, 422, "64-bit", path=f"{TWIN}/models"),
+    Case("model: nested past storing", '{"spec":' * 500 + "1" + "}" * 500, 422, "body", path=f"{TWIN}/models"),
     Case("diagnosis: text for a share", {"holdout": "0.3"}, 422, "holdout", path=f"{TWIN}/diagnoses"),
     Case(
         "spec: next to nothing",

@@ -1,7 +1,8 @@
 """Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -114,6 +115,15 @@ class Search:
     left_out: list[str] = field(default_factory=list)
     every: int = 1
     first: Collection[Place] = ()
+
+    @contextmanager
+    def until(self, deadline: float) -> Iterator[None]:
+        """Work to an earlier deadline for a while."""
+        own, self.deadline = self.deadline, deadline
+        try:
+            yield
+        finally:
+            self.deadline = own
 
     def fork(self) -> "Search":
         """Return a search that starts from here and shares what failed or was left out."""

@@ -1,6 +1,7 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
 import os
+import time
 from collections.abc import Collection, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -49,6 +50,9 @@ RIVAL_NATS = 20.0
 N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
 
+REVISION_SHARE = 0.25
+"""Share of the time that is left for looking over what was found: what has not been is no answer yet."""
+
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
 
@@ -70,7 +74,8 @@ def search(
     false_alarm_rate
         Odds at which a finding on a healthy record is tolerated.
     deadline
-        On the clock of ``time.monotonic``: what is not fitted by then is left out, and told.
+        On the clock of ``time.monotonic``: what is not fitted by then is left out, and told. A part of the time is kept for
+        the revision of what was found.
     first
         Places of effects that spacecraft of the same design have.
     progress
@@ -83,10 +88,13 @@ def search(
     """
     state = Search(base, base, deadline=deadline, first=first)
     needed = threshold(false_alarm_rate)
+    now = time.monotonic()
+    looking = now + (1.0 - REVISION_SHARE) * (deadline - now)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
         before = state.fork()
-        extended = _extend(state, needed, fallback=False)
+        with state.until(looking):
+            extended = _extend(state, needed, fallback=False)
         refused, before.rejected = state.rejected[len(before.rejected) :], list(state.rejected)
         if exchange(before, refused, needed):
             state.join(before)
@@ -97,7 +105,8 @@ def search(
     withdraw(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
-        _extend(state, needed, fallback=True)
+        with state.until(looking):
+            _extend(state, needed, fallback=True)
         withdraw(state, needed)
     reconsider(state, needed)
     progress(0.95, "comparing what was found with other names")

@@ -94,9 +94,9 @@ def forecast(
     Returns
     -------
     Forecast
-        The bands contain the state's uncertainty, the parameters', the misfit that the calibration saw (growing with lead
-        time up to its stationary size), the sensor's noise, what a learned heat may be outside its visited range, and
-        what the assumed inputs missed in the past over the same lead times.
+        The bands contain the state's uncertainty, the parameters', the misfit that the calibration saw (growing up to its
+        stationary size as the network forgets where it started), the sensor's noise, what a learned heat may be outside
+        its visited range, and what the assumed inputs missed in the past over the same lead times.
 
     Raises
     ------

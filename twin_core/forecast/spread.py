@@ -1,4 +1,10 @@
-"""How far readings may lie from the rollout although the inputs are as given: state, parameters, misfit, noise."""
+"""How far readings may lie from the rollout although the inputs are as given: state, parameters, misfit, noise.
+
+The misfit of a calibration is how far readings lie from a rollout that nothing corrects: an Ornstein-Uhlenbeck process M of
+each sensor. A state that follows the readings has taken M(0) for a temperature, and the network forgets it at its own pace,
+not at that of the misfit. So the rollout misses M(t) - Phi(t) M(0), where Phi is how a start moves the readings: nothing at
+first, and the whole misfit once the start is forgotten, however slowly M itself moves.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,20 +78,32 @@ def spread(
     kept = wanted[stride - 1 :: stride] if wanted.size >= stride else wanted[-1:]
     rng = np.random.default_rng(0)
     drawn = _root(covariance) @ rng.standard_normal((covariance.shape[0], DRAWS))
-    variances, lines = [], []
-    for window, block in sensitivities(network, network.parameters.values, forcing, path, starts, network.sensor_node):
-        variances.append(((block @ covariance) * block).sum(axis=-1))
-        inside = kept[(kept >= window.start) & (kept < window.stop)]
-        lines.append(block[inside - window.start] @ drawn)
-    paths = np.concatenate(lines).transpose(2, 0, 1)
-    outside = extrapolated_variance_K2(network, beyond, forcing, path, network.sensor_node)
-    paths += rng.standard_normal((DRAWS, 1, 1)) * np.sqrt(outside[kept])
     misfit = np.array([model.misfit_K[s] for s in model.spec.sensors])
     length = np.maximum(np.array([model.misfit_length_s[s] for s in model.spec.sensors]), 1e-9)
     lead = time_s - time_s[0]
+    now_K = misfit[:, None] * rng.standard_normal((n_sensors, DRAWS))
+    variances, lines = [], []
+    for window, block in sensitivities(network, network.parameters.values, forcing, path, starts, network.sensor_node):
+        left = _misfit_left(network, block[:, :, n_free:], np.exp(-lead[window, None] / length))
+        variances.append(((block @ covariance) * block).sum(axis=-1) + left**2 @ misfit**2)
+        inside = kept[(kept >= window.start) & (kept < window.stop)] - window.start
+        lines.append(block[inside] @ drawn + left[inside] @ now_K)
+    paths = np.concatenate(lines).transpose(2, 0, 1)
+    outside = extrapolated_variance_K2(network, beyond, forcing, path, network.sensor_node)
+    paths += rng.standard_normal((DRAWS, 1, 1)) * np.sqrt(outside[kept])
     paths += _misfit_paths(rng, misfit, length, lead[kept])
     grown = misfit**2 * (1.0 - np.exp(-2.0 * lead[:, None] / length))
     return Spread(np.concatenate(variances) + outside + grown + model.noise_vector_K() ** 2, kept, paths)
+
+
+def _misfit_left(network: Network, by_start: FloatArray, faded: FloatArray) -> FloatArray:
+    """Return what each sensor's misfit of the start still does to the readings, (n_times, n_sensors, n_sensors).
+
+    Sensors of one node have given it the mean of theirs. ``by_start`` is (n_times, n_sensors, n_nodes), ``faded``
+    (n_times, n_sensors) what is left of the misfits themselves.
+    """
+    node = network.sensor_node
+    return faded[:, :, None] * np.eye(node.size) - by_start[:, :, node] / np.bincount(node)[node]
 
 
 def _root(covariance: FloatArray) -> FloatArray:

@@ -215,9 +215,10 @@ export class TemperatureChart extends Chart {
       ctx.lineTo(x + 4 * dot, bbox.top + bbox.height);
       ctx.lineTo(x, bbox.top + bbox.height - 7 * dot);
       ctx.fill();
-      if (x < free) continue;
-      ctx.fillText(text, x + 5 * dot, bbox.top + bbox.height - 5 * dot);
-      free = x + ctx.measureText(text).width + 12 * dot;
+      const at = besideLine(ctx, bbox, text, x, 5 * dot);
+      if (at < free) continue;
+      ctx.fillText(text, at, bbox.top + bbox.height - 5 * dot);
+      free = Math.max(x, at + ctx.measureText(text).width) + 12 * dot;
     }
     ctx.restore();
   }
@@ -236,9 +237,16 @@ export class TemperatureChart extends Chart {
     ctx.stroke();
     ctx.fillStyle = css("--muted");
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
-    haloed(ctx, "forecast →", x + 6 * devicePixelRatio, bbox.top + 12 * devicePixelRatio);
+    const text = "forecast →", room = 6 * devicePixelRatio;
+    haloed(ctx, text, besideLine(ctx, bbox, text, x, room), bbox.top + 2 * room);
     ctx.restore();
   }
+}
+
+// Where a line's text begins: right of it, or left where it would be cut off.
+function besideLine(ctx, bbox, text, x, gap) {
+  const width = ctx.measureText(text).width;
+  return x + gap + width <= bbox.left + bbox.width ? x + gap : x - gap - width;
 }
 
 // Text that stays readable over lines.

@@ -73,7 +73,21 @@ function spread(places) {
 function curve([ax, ay], [bx, by], bend) {
   const length = Math.hypot(bx - ax, by - ay) || 1;
   const mx = (ax + bx) / 2 - ((by - ay) / length) * bend, my = (ay + by) / 2 + ((bx - ax) / length) * bend;
-  return { path: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, middle: [(ax + bx) / 4 + mx / 2, (ay + by) / 4 + my / 2] };
+  const at = (t) => [[ax, mx, bx], [ay, my, by]].map(([from, over, to]) => (1 - t) ** 2 * from + 2 * t * (1 - t) * over + t * t * to);
+  return { path: `M${ax} ${ay}Q${mx} ${my} ${bx} ${by}`, middle: at(0.5), at };
+}
+
+// A link's arrowhead with its figure stands where that covers no place, no name and no other figure: in the middle, or
+// else towards an end.
+const ALONG = [0.5, 0.42, 0.58, 0.35, 0.65, 0.28, 0.72];
+
+function clearSpot(at, lift, text, taken) {
+  const half = 3.4 * text.length + 2, boxes = ALONG.map((t) => ((p) => [p[0] - half, p[1] - lift - 11, p[0] + half, p[1] - lift + 3])(at(t)));
+  const covered = ([x0, y0, x1, y1]) => taken.reduce((sum, [u0, v0, u1, v1]) =>
+    sum + Math.max(0, Math.min(x1, u1) - Math.max(x0, u0)) * Math.max(0, Math.min(y1, v1) - Math.max(y0, v0)), 0);
+  const areas = boxes.map(covered), best = areas.indexOf(Math.min(...areas));
+  taken.push(boxes[best]);
+  return at(ALONG[best]);
 }
 
 export class NetworkDrawing {
@@ -101,6 +115,8 @@ export class NetworkDrawing {
     const strongest = Math.max(1e-9, ...picture.links.map((l) => Math.abs(l.heat_W || 0)));
     const joined = new Set();
     const labels = [];
+    this.taken = [...this.places].flatMap(([name, [x, y]]) => [[x - 27, y - 27, x + 27, y + 27], [x - 4 * name.length, y + 29, x + 4 * name.length, y + 46]]);
+    this.taken.push(...picture.loads.map(({ node }) => this.places.get(node)).map(([x, y]) => [x - 30, y - 44, x + 30, y - 27]));
     for (const link of picture.links) svg.append(...this.link(link, strongest, joined, labels));
     for (const effect of picture.effects) svg.append(...this.effect(effect));
     const known = picture.nodes.map((p) => p.temperature_K).filter((t) => t !== null);
@@ -128,7 +144,7 @@ export class NetworkDrawing {
     const pair = [...link.ends].sort().join("|");
     const bend = link.kind === "radiator" || joined.has(pair) ? 22 : 0;
     joined.add(pair);
-    const { path, middle } = curve(a, b, bend);
+    const { path, at } = curve(a, b, bend);
     const share = Math.abs(link.heat_W || 0) / strongest, width = 2 + 7 * Math.sqrt(share);
     const parts = [draw("path", { d: path, class: "tube", "stroke-width": width, opacity: link.kind === "radiator" ? 0.45 : 0.9 })];
     if (link.heat_W === null) return parts;
@@ -142,11 +158,12 @@ export class NetworkDrawing {
     flow.append(draw("title", {}, `${way.join(" → ")}: ${watts(Math.abs(link.heat_W))}`));
     flow.dataset.ends = link.ends.join("|");
     const size = 5 + width, flows = share >= 0.004;  // the figure stands clear of the arrowhead
-    labels.push(draw("text", { x: middle[0], y: middle[1] - (flows ? size + 4 : 9), class: "value halo" }, watts(Math.abs(link.heat_W))));
+    const figure = watts(Math.abs(link.heat_W)), lift = flows ? size + 4 : 9, [x, y] = clearSpot(at, lift, figure, this.taken);
+    labels.push(draw("text", { x, y: y - lift, class: "value halo" }, figure));
     if (!flows) return [...parts, flow];
     const [from, to] = link.heat_W < 0 ? [b, a] : [a, b];
     const turn = (Math.atan2(to[1] - from[1], to[0] - from[0]) * 180) / Math.PI;
-    const head = draw("path", { d: `M${size} 0L${-size * 0.7} ${size * 0.75}L${-size * 0.7} ${-size * 0.75}Z`, class: "head", fill: link.kind === "radiator" ? "#7a6ff0" : "#e8743b", transform: `translate(${middle[0]} ${middle[1]}) rotate(${turn})` });
+    const head = draw("path", { d: `M${size} 0L${-size * 0.7} ${size * 0.75}L${-size * 0.7} ${-size * 0.75}Z`, class: "head", fill: link.kind === "radiator" ? "#7a6ff0" : "#e8743b", transform: `translate(${x} ${y}) rotate(${turn})` });
     return [...parts, flow, head];
   }
 

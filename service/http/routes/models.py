@@ -2,7 +2,9 @@
 
 from typing import Annotated, Any
 
+import orjson
 from fastapi import APIRouter, Body, Path
+from pydantic import AfterValidator
 
 from service.http.deps import NamedTwin, Running, operates, reads
 from service.jobs import outcome
@@ -16,6 +18,16 @@ router = APIRouter(prefix="/v1/twins/{twin}/models", tags=["models"])
 
 MOST_COMPARED = 30
 """So many of the newest versions are compared over the same telemetry."""
+
+
+def _storable(document: dict[str, Any]) -> dict[str, Any]:
+    try:
+        orjson.dumps(document)
+    except TypeError as error:  # integers beyond 64 bits, and what is nested too deeply
+        raise ValueError(f"cannot be stored: {error}") from None
+    return document
+
+
 Version = Annotated[int, Path(ge=1, le=2**62, description="Number of a version.")]
 
 
@@ -55,7 +67,9 @@ async def delete(service: Running, twin: NamedTwin, version: Version) -> None:
 
 
 @router.post("", status_code=201, dependencies=[operates])
-async def add(service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body()]) -> ModelInfo:
+async def add(
+    service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body(), AfterValidator(_storable)]
+) -> ModelInfo:
     """Store a model that the command line made for this twin as a new version, not active."""
     made = await service.live.inspect(body)
     refuse_foreign(load_spec(made.document["spec"]), twin)

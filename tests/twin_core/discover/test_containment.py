@@ -16,7 +16,8 @@ from twin_core.calibrate.problem import Fit
 from twin_core.calibrate.second_order import fit_network, from_heat_fit
 from twin_core.closed_loop import close_loop
 from twin_core.discover.confirm import Trial, try_effects
-from twin_core.discover.search import search
+from twin_core.discover.judge import Search
+from twin_core.discover.search import REVISION_SHARE, search
 from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
 from twin_core.report.phrasing import headline
@@ -142,3 +143,27 @@ def test_an_impossible_deadline_is_refused(deadline_s: float) -> None:
     case = network_case(None, 1, n_orbits=3, dt_s=300.0)
     with pytest.raises(TelemetryError, match="deadline_s: must be a positive number of seconds"):
         close_loop(case.spec, [case.record], deadline_s=deadline_s)
+
+
+def test_what_was_found_is_looked_over_when_the_time_for_looking_is_up(
+    base: Trial, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second effect comes with the last second of looking: whether it is needed is asked all the same."""
+    clock, extended, asked = [0.0], [], []
+    monkeypatch.setattr("twin_core.calibrate.containment.time.monotonic", lambda: clock[0])
+
+    def extend(state: Search, needed: float, *, fallback: bool) -> bool:
+        extended.append(state.deadline)
+        clock[0] += 40.0
+        return state.attempt(lambda: True, "looking") is True
+
+    def withdraw(state: Search, needed: float) -> None:
+        asked.append(state.attempt(lambda: "looked over", "the model without it"))
+
+    monkeypatch.setattr("twin_core.discover.search._extend", extend)
+    monkeypatch.setattr("twin_core.discover.search.withdraw", withdraw)
+    monkeypatch.setattr("twin_core.discover.search.exchange", lambda *_: False)
+    found = search(base, false_alarm_rate=0.01, deadline=100.0)
+    assert extended[0] == extended[1] == pytest.approx(100.0 * (1.0 - REVISION_SHARE))
+    assert found.left_out[0] == "looking" and asked[0] == "looked over"
+    assert found.deadline == 100.0
