@@ -36,7 +36,7 @@ from tests.service.postgres import fresh_database, own_server
 TWINS, DAYS, KEPT_DAYS, ROWS_A_DAY = 10, 1460, 730, 144
 DAY_US = 86_400_000_000
 INGEST_TWINS = 50
-SHAPES = ((200, 12, SHARE), (10, 40, 4 * SHARE), (1, 40, 4 * SHARE))
+SHAPES = ((200, 12, SHARE), (10, 16, 4 * SHARE), (1, 16, 4 * SHARE))
 """Samples in a batch, blocks, batches in a block."""
 READS = 200
 
