@@ -40,8 +40,8 @@ VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
 LEAST_VALIDATION = 20
 LEAST_SAMPLES = 20
-MOST_DERIVATIVES = 30_000_000
-"""So many derivatives of readings by parameters a job works with unless asked for more; a fit holds some copies, 240 MB each."""
+MOST_DERIVATIVES = 20_000_000
+"""So many derivatives of readings by parameters a job works with unless asked for more; a fit holds some copies, 160 MB each."""
 MOST_WAITING = 16
 """Most jobs of one twin that may be queued or running."""
 LEASE_S, BEAT_S = 20.0, 4.0

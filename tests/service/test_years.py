@@ -103,7 +103,7 @@ def test_a_job_takes_the_newest_samples_and_says_so(make_client: Any) -> None:
     assert client.post(f"{TWIN}/calibrations", json={"samples": 3}).status_code == 422
 
 
-@pytest.mark.parametrize(("n_nodes", "samples"), [(1, 125_000), (11, 20_833), (199, 379), (3000, 20)])
+@pytest.mark.parametrize(("n_nodes", "samples"), [(1, 125_000), (11, 20_833), (199, 253), (3000, 20)])
 def test_a_job_takes_fewer_samples_of_a_wide_network(n_nodes: int, samples: int) -> None:
     channels = {"Q": {"kind": "power", "unit": "W"}}
     row = conductive_spec(n_nodes, [(i, i + 1) for i in range(n_nodes - 1)], channels=channels)
