@@ -107,7 +107,7 @@ def services(
 
 def over_http(url: str, count: int, n_twins: int, folder: Path, seconds: float) -> float:
     """Return requests per second, of 10 samples each, into so many processes for so many twins."""
-    prepare(url, n_twins)
+    prepare(url, n_twins, is_watched=False)
     with services(url, count, folder, TWIN_ASSIMILATE="false") as running:
         stop_s = time.perf_counter() + seconds
         done = [0] * LANES
@@ -138,7 +138,7 @@ def over_http(url: str, count: int, n_twins: int, folder: Path, seconds: float) 
 
 def takeover_s(url: str, folder: Path) -> float:
     """Return the time from the kill of one of two owners until every slot is owned by the other."""
-    prepare(url, 50)
+    prepare(url, 50, is_watched=False)
     with services(url, 2, folder) as running, psycopg.connect(url, autocommit=True) as connection:
         query = "SELECT count(DISTINCT owner), count(*) FROM slot WHERE until_us > clock_us()"
         while connection.execute(query).fetchone() != (2, 256):

@@ -36,7 +36,7 @@ from tests.service.postgres import fresh_database, own_server
 TWINS, DAYS, KEPT_DAYS, ROWS_A_DAY = 10, 1460, 730, 144
 DAY_US = 86_400_000_000
 INGEST_TWINS = 50
-SHAPES = ((200, 12, SHARE), (10, 40, 4 * SHARE), (1, 40, 4 * SHARE))
+SHAPES = ((200, 12, SHARE), (10, 16, 4 * SHARE), (1, 16, 4 * SHARE))
 """Samples in a batch, blocks, batches in a block."""
 READS = 200
 
@@ -70,16 +70,21 @@ def fill(database: Database, server: Server) -> None:
     server.execute("VACUUM ANALYZE")
 
 
-def read_ms(server: Server, table: str, where: str, parameters: Callable[[int], Sequence[int]]) -> float:
-    """Return the time of one of the store's own statements, the median of READS; ``parameters`` are those for a twin."""
-    query = f"SELECT time, value FROM {table} WHERE {where} ORDER BY first_us, id".replace("?", "%s")
-    took = []
+def read_ms(server: Server, parameters: Callable[[int], Sequence[int]], **where: str) -> list[float]:
+    """Return the times of the store's own statements, medians of READS each in turn.
+
+    ``where`` holds a condition for each table; ``parameters`` are those for a twin, as many of them as a condition takes.
+    """
+    took: dict[str, list[float]] = {table: [] for table in where}
     for k in range(READS):
-        begun = time.perf_counter()
-        found = server.execute(query, parameters(1 + k % TWINS), binary=True).fetchall()  # type: ignore[arg-type]
-        took.append(time.perf_counter() - begun)
-        assert len(found) == 1
-    return 1e3 * float(np.median(took))
+        for table, condition in where.items():
+            query = f"SELECT time, value FROM {table} WHERE {condition} ORDER BY first_us, id".replace("?", "%s")
+            given = parameters(1 + k % TWINS)[: condition.count("?")]
+            begun = time.perf_counter()
+            found = server.execute(query, given, binary=True).fetchall()  # type: ignore[arg-type]
+            took[table].append(time.perf_counter() - begun)
+            assert len(found) == 1
+    return [1e3 * float(np.median(times)) for times in took.values()]
 
 
 def logged(server: Server, action: Callable[[], object]) -> tuple[float, float]:
@@ -118,22 +123,18 @@ def measure_ingest(url: str, tell: Tell) -> None:
 
 def measure_reads(server: Server, tell: Tell) -> None:
     """Measure the store's reads beside those of a table that is not divided."""
+    plain, newest = "twin = ? AND last_us >= ? AND first_us < ?", "twin = ? AND last_seq > ?"
+
+    def beside(what: str, divided: float, whole: float) -> None:
+        """Add a row."""
+        tell(what, f"{divided:.2f} ms", f"undivided {whole:.2f} ms", f"{divided / whole:.1f}")
+
     for what, day in (("newest", DAYS - 1), ("middle", DAYS // 2)):
         start = BEGIN_US + day * DAY_US
-        divided = read_ms(server, "chunk", WITHIN, lambda twin, a=start: within(twin, a, a + DAY_US))  # type: ignore[misc]
-        plain = "twin = ? AND last_us >= ? AND first_us < ?"
-        whole = read_ms(server, "undivided", plain, lambda twin, a=start: (twin, a, a + DAY_US))  # type: ignore[misc]
-        tell(
-            f"read of the {what} day of {DAYS}",
-            f"{divided:.2f} ms",
-            f"undivided {whole:.2f} ms",
-            f"{divided / whole:.1f}",
-        )
-    newest = "twin = ? AND last_seq > ?"
-    divided, whole = (
-        read_ms(server, table, newest, lambda twin: (twin, DAYS * ROWS_A_DAY - 1)) for table in ("chunk", "undivided")
-    )
-    tell("read of what came last", f"{divided:.2f} ms", f"undivided {whole:.2f} ms", f"{divided / whole:.1f}")
+        found = read_ms(server, lambda twin, a=start: within(twin, a, a + DAY_US), chunk=WITHIN, undivided=plain)  # type: ignore[misc]
+        beside(f"read of the {what} day of {DAYS}", *found)
+    found = read_ms(server, lambda twin: (twin, DAYS * ROWS_A_DAY - 1), chunk=newest, undivided=newest)
+    beside("read of what came last", *found)
 
 
 def measure_retention(database: Database, server: Server, tell: Tell) -> None:

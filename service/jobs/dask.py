@@ -48,8 +48,8 @@ class DaskTasks(Tasks):
     def _supervise(self, task: Task[T]) -> T:
         client = self._connected()
         topic = f"twin-{uuid.uuid4().hex}"
+        client.subscribe_topic(topic, lambda event: task.progress(*event[1]))  # before anything can be said
         future = client.get_executor(pure=False, retries=2).submit(_run, topic, task.function, task.args)
-        client.subscribe_topic(topic, lambda event: task.progress(*event[1]))
         until_s = time.monotonic() + self._deadline_s
         seen_s = time.monotonic()
         try:
@@ -67,6 +67,8 @@ class DaskTasks(Tasks):
             raise ExecutorLost(f"{type(error).__name__}: {error}") from error
         finally:
             future.cancel()
+            if client.status == "running":
+                client.unsubscribe_topic(topic)
         if kind == "failed":
             raise JobFailed(*rest)
         done: T = rest[0]

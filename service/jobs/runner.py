@@ -30,6 +30,7 @@ from service.stream.hub import Hub
 from service.twins.registry import Entry
 from service.workbench.interface import CalibrationTask, DiagnosisTask, MakeWorkbench, Telemetry, work
 from twin_core import __version__
+from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import GAP_STEPS
 
 log = logging.getLogger("service.jobs")
@@ -39,6 +40,8 @@ VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
 LEAST_VALIDATION = 20
 LEAST_SAMPLES = 20
+MOST_DERIVATIVES = 20_000_000
+"""So many derivatives of readings by parameters a job works with unless asked for more; a fit holds some copies, 160 MB each."""
 MOST_WAITING = 16
 """Most jobs of one twin that may be queued or running."""
 LEASE_S, BEAT_S = 20.0, 4.0
@@ -60,6 +63,12 @@ class _Running:
     held: Claim
     cancel: Cancel
     task: "asyncio.Task[None] | None" = None
+
+
+def usual_samples(spec: TwinSpec, values: int) -> int:
+    """Return how many samples a job takes unless asked: of at most so many values, fewer of a network that is wide."""
+    per_sample = len(spec.sensors) * (len(spec.nodes) + len(spec.conductors))
+    return max(min(values // len(spec.channels), MOST_DERIVATIVES // max(per_sample, 1)), LEAST_SAMPLES)
 
 
 class Jobs:
@@ -289,7 +298,7 @@ class Jobs:
             None if (at := request.get(n)) is None else parse_instant(at, n) for n in ("start", "stop")
         )
         n, spec = len(twin.channels), twin.spec
-        most = request.get("samples") or max(self._job_values // n, LEAST_SAMPLES)
+        most = request.get("samples") or usual_samples(spec, self._job_values)
         sensors = [twin.channels.index(name) for name in twin.sensors]
         averaged = [
             row

@@ -12,17 +12,20 @@ import pandas as pd
 import pytest
 
 from service.jobs.executor import JobFailed, ProcessPerTask, Task
+from service.jobs.runner import usual_samples
 from service.running.housekeeping import Housekeeping
 from service.store import appending, retention, selection
 from service.store.batch import Batch
 from service.store.database import Database
 from service.workbench.core import CoreWorkbench
 from service.workbench.interface import DiagnosisTask, Telemetry
+from tests.helpers import conductive_spec
 from tests.service.conftest import SPEC, STORE, Sql
 from tests.service.fakes import SHORTEST_SEARCH_S, FakeWorkbench
 from tests.service.harness import AppClient, until
 from tests.service.test_jobs import finish
 from twin_core._typing import no_progress
+from twin_core.network.spec_io import load_spec
 
 TWIN = "/v1/twins/benchsat"
 N = 3000
@@ -98,6 +101,13 @@ def test_a_job_takes_the_newest_samples_and_says_so(make_client: Any) -> None:
     job = calibrate(client, {"samples": 5000})
     assert "samples" not in job["message"].partition("; from")[2]
     assert client.post(f"{TWIN}/calibrations", json={"samples": 3}).status_code == 422
+
+
+@pytest.mark.parametrize(("n_nodes", "samples"), [(1, 125_000), (11, 20_833), (199, 253), (3000, 20)])
+def test_a_job_takes_fewer_samples_of_a_wide_network(n_nodes: int, samples: int) -> None:
+    channels = {"Q": {"kind": "power", "unit": "W"}}
+    row = conductive_spec(n_nodes, [(i, i + 1) for i in range(n_nodes - 1)], channels=channels)
+    assert usual_samples(load_spec(row), 250_000) == samples
 
 
 def test_a_search_has_a_deadline_and_one_that_was_cut_short_is_told(make_client: Any) -> None:

@@ -145,7 +145,7 @@ def forecast(
     return Forecast(future.time_s[wanted], model.spec.sensors, mean, made, whole, assumed.how, notices)
 
 
-_BAND = (0.5 - 0.5 * WHOLE, 0.5, 0.5 + 0.5 * WHOLE)
+_BAND = (round(0.5 - 0.5 * WHOLE, 9), 0.5, round(0.5 + 0.5 * WHOLE, 9))
 """The quantiles that are widened to the simultaneous band."""
 
 

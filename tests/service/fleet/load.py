@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 
 import httpx
@@ -25,6 +26,19 @@ REPORT = os.environ.get("FLEET_FAULTS")
 KEY = "secret"
 BEGIN_S = 1_700_000_000
 MODEL = {"rmse_K": 0.1, "max_step_s": 60.0, "spec": SPEC, "effects": []}
+WITNESS = """
+    CREATE TABLE written (
+        number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY, twin BIGINT, epoch BIGINT, writer TEXT
+    );
+    CREATE FUNCTION witness() RETURNS trigger LANGUAGE plpgsql AS $$BEGIN
+        INSERT INTO written (twin, epoch, writer)
+        SELECT NEW.twin, slot.epoch, host(inet_client_addr()) || ':' || inet_client_port()
+        FROM slot WHERE slot.number = mod(NEW.twin, 256);
+        RETURN NULL;
+    END$$;
+    CREATE TRIGGER witness AFTER INSERT OR UPDATE ON checkpoint FOR EACH ROW EXECUTE FUNCTION witness();
+"""
+"""The database notes by itself which connection writes the live state of a twin in which epoch."""
 SKEWED = "import time; real = time.time_ns; time.time_ns = lambda: real() + {skew_s} * 10**9;" + FAKE
 
 
@@ -33,8 +47,8 @@ def names(count: int) -> list[str]:
     return [f"sat-{k}" for k in range(count)]
 
 
-def prepare(url: str, count: int) -> None:
-    """Register twins, each with an active model."""
+def prepare(url: str, count: int, *, is_watched: bool = True) -> None:
+    """Register twins, each with an active model, and let the database note who writes their live state."""
     database = Database(url)
 
     def fill(connection: Connection) -> None:
@@ -46,6 +60,9 @@ def prepare(url: str, count: int) -> None:
 
     database.submit(fill).result(30)
     database.close()
+    if is_watched:
+        with psycopg.connect(url) as connection:
+            connection.execute(WITNESS)
 
 
 @contextlib.contextmanager
@@ -205,6 +222,14 @@ def tally(url: str, load: Load, wait_s: float = 60.0) -> Tally:
         query = "SELECT slot, epoch, owner, from_us, lead(from_us) OVER (PARTITION BY slot ORDER BY epoch) FROM tenure"
         rows = connection.execute(query).fetchall()
         owned_twice = sum(later is not None and later < begun for _, _, _, begun, later in rows) + (not rows)
+        written = connection.execute("SELECT twin, epoch, writer FROM written ORDER BY number").fetchall()
+        writers: dict[tuple[int, int], list[str]] = {}
+        for twin, epoch, writer in written:
+            writers.setdefault((twin, epoch), []).append(writer)
+        for order in writers.values():  # whoever was followed by another one in an epoch does not come back in it
+            turns = [writer for writer, _ in groupby(order)]
+            owned_twice += len(turns) - len(set(turns))
+        owned_twice += not written
     return Tally(load.acknowledged, load.refused, lost, twice, wrong + len(load.wrong), owned_twice)
 
 
@@ -213,20 +238,6 @@ def assert_nothing_lost(url: str, load: Load, fault: str, wait_s: float = 60.0) 
     found = tally(url, load, wait_s)
     found.note(fault)
     found.assert_nothing_lost()
-
-
-def job_tally(url: str, jobs: Sequence[str], wait_s: float = 120.0) -> Tally:
-    """Wait until jobs have ended; tell how many did not succeed, and how many models they left beyond one each."""
-    end_s = time.monotonic() + wait_s
-    with psycopg.connect(url, autocommit=True) as connection:
-        while True:
-            rows = connection.execute("SELECT state, result FROM job WHERE id = ANY(%s)", (list(jobs),)).fetchall()
-            if all(state not in ("queued", "running") for state, _ in rows) or time.monotonic() > end_s:
-                break
-            time.sleep(0.2)
-        made = connection.execute("SELECT count(*) FROM model WHERE source <> 'manual'").fetchone()[0]  # type: ignore[index]
-    done = sum(state == "succeeded" for state, _ in rows)
-    return Tally(len(jobs), 0, jobs_lost=len(jobs) - done, jobs_twice=max(made - done, 0))
 
 
 def calibrations(service: Server, count: int) -> list[str]:
@@ -249,8 +260,7 @@ def assert_jobs_done_once(url: str, jobs: Sequence[str], fault: str, wait_s: flo
             if not {"queued", "running"} & set(states) or time.monotonic() > end_s:
                 break
             time.sleep(0.2)
-        query = "SELECT count(*) FROM model WHERE source = 'calibration'"
-        made = connection.execute(query).fetchone()[0]  # type: ignore[index]
+        made = connection.execute("SELECT count(*) FROM model WHERE source = 'calibration'").fetchone()[0]  # type: ignore[index]
     done = states.count("succeeded")
     found = Tally(len(jobs), 0, jobs_lost=len(jobs) - done, jobs_twice=max(made - done, 0))
     found.note(fault)

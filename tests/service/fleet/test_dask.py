@@ -19,9 +19,12 @@ pytestmark = [pytest.mark.fleet, pytest.mark.filterwarnings("ignore")]
 Progress = Callable[[float, str], None]
 
 
-def answer(value: float, progress: Progress) -> float:
+def answer(value: float, heard: str, progress: Progress) -> float:
+    """Return the double once somebody has heard that half is done."""
     progress(0.5, "half")
-    time.sleep(0.5)
+    end_s = time.monotonic() + 60.0
+    while not Path(heard).exists() and time.monotonic() < end_s:
+        time.sleep(0.05)
     return 2 * value
 
 
@@ -34,11 +37,16 @@ def dawdle(progress: Progress) -> int:
     return os.getpid()
 
 
-def test_results_refusals_and_progress_come_back(cluster: Cluster) -> None:
-    tasks = DaskTasks(cluster.address, 2, 60.0)
+def test_results_refusals_and_progress_come_back(cluster: Cluster, tmp_path: Path) -> None:
+    tasks = DaskTasks(cluster.address, 2, 120.0)
     heard: list[str] = []
-    done = tasks.start(Task(answer, (21.0,), lambda fraction, message: heard.append(message)))
-    assert done.result(60) == 42.0 and heard == ["half"]
+
+    def hear(fraction: float, message: str) -> None:
+        heard.append(message)
+        (tmp_path / "heard").touch()
+
+    done = tasks.start(Task(answer, (21.0, str(tmp_path / "heard")), hear))
+    assert done.result(120) == 42.0 and heard == ["half"]
     with pytest.raises(JobFailed, match="no solution"):
         tasks.start(Task(refuse)).result(60)
     cancel = Cancel()

@@ -1,9 +1,11 @@
 """Leases, epochs and fencing, by the clock of the database."""
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import psycopg
 import pytest
 
 from service.store import ownership, twins
@@ -28,19 +30,16 @@ class Rooms:
         """Write, and wait for the commit."""
         return self.database.submit(operation, *args).result(30)
 
-    def lapse(self, name: str) -> None:
-        """Let time pass for one member: its leases and its word are long ago."""
-
-        def age(connection: Connection) -> None:
-            connection.execute("UPDATE slot SET until_us = clock_us() - 1 WHERE owner = ?", (name,))
-            connection.execute("UPDATE member SET beat_us = beat_us - ? WHERE name = ?", (2 * LEASE_US, name))
-
-        self.do(age)
-
     def renew(self, name: str) -> Holding:
         """Renew the leases of a member."""
         holding: Holding = self.do(ownership.renew, name, LEASE_US)
         return holding
+
+
+def lapse(connection: Connection, name: str) -> None:
+    """Let time pass for one member: its leases and its word are long ago."""
+    connection.execute("UPDATE slot SET until_us = clock_us() - 1 WHERE owner = ?", (name,))
+    connection.execute("UPDATE member SET beat_us = beat_us - ? WHERE name = ?", (2 * LEASE_US, name))
 
 
 @pytest.fixture
@@ -65,7 +64,7 @@ def test_whoever_lapsed_cannot_write_and_epochs_only_grow(rooms: Rooms) -> None:
     slot = slot_of(rooms.twin)
     epoch = rooms.renew("one").epochs[slot]
     rooms.do(ownership.check, rooms.twin, epoch)
-    rooms.lapse("one")
+    rooms.do(lapse, "one")
     with pytest.raises(LeaseLost):  # although nobody has taken over yet
         rooms.do(ownership.check, rooms.twin, epoch)
     later = rooms.renew("two").epochs[slot]
@@ -82,25 +81,32 @@ def test_whoever_lapsed_cannot_write_and_epochs_only_grow(rooms: Rooms) -> None:
     assert tenures == [(epoch, "one"), (later, "two")]
 
 
-def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms) -> None:
+def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms, postgres: str) -> None:
     epoch = rooms.renew("one").epochs[slot_of(rooms.twin)]
-    other = Database(rooms.database.engine.url)  # type: ignore[attr-defined]
+    other = Database(postgres)
     order: list[str] = []
+    is_under_way, may_end = threading.Event(), threading.Event()
 
     def slowly(connection: Connection) -> None:
         ownership.check(connection, rooms.twin, epoch)
-        time.sleep(0.5)
+        is_under_way.set()
+        assert may_end.wait(30)
         order.append("written")
 
-    rooms.lapse("one")
-    rooms.do(lambda c: c.execute("UPDATE slot SET until_us = clock_us() + 200000 WHERE owner = 'one'") and None)
     rooms.database.submit_to(rooms.twin, lambda result, error: order.append(f"answered {error}"), slowly)
-    time.sleep(0.3)  # the lease lapses while the write goes on
-    taken = other.submit(ownership.renew, "two", LEASE_US).result(30)
-    order.append("taken over")
-    assert slot_of(rooms.twin) in taken.epochs
-    assert order[0] == "written" and order.index("written") < order.index("taken over")
+    assert is_under_way.wait(30)
+    other.submit(lapse, "one").result(30)
+    takeover = other.submit(ownership.renew, "two", LEASE_US)
+    takeover.add_done_callback(lambda done: order.append("taken over"))
+    with psycopg.connect(postgres, autocommit=True) as server:
+        waits = "SELECT 1 FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND query LIKE 'UPDATE head SET epoch%'"
+        while server.execute(waits).fetchone() is None:
+            assert not takeover.done()
+            time.sleep(0.05)
+    may_end.set()
+    assert slot_of(rooms.twin) in takeover.result(30).epochs
     other.close()
+    assert order[0] == "written" and sorted(order[1:]) == ["answered None", "taken over"]
 
 
 def test_leaving_gives_everything_back_at_once(rooms: Rooms) -> None:
