@@ -70,9 +70,10 @@ def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
             first_us = int(time_us[0])
             if known is not None and (known.last_us is None or known.last_us < first_us):
                 return _put(stage, known, twin, batch, first_us)
-        head = _advance(connection, twin, batch, n, after_all=True)
+        ends = (int(time_us[0]), int(time_us[-1]))
+        head = _advance(connection, twin, batch, n, ends, after_all=True)
         if head is not None:
-            _write(connection, twin, batch, head)
+            _write(connection, twin, batch, head, ends)
             return Receipt(np.zeros(n, dtype=np.int8), head[0] - n + 1, int(time_us[-1]))
     return _merge_in(connection, twin, batch)
 
@@ -107,23 +108,26 @@ def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
     if not kept.any():
         return Receipt(fate.status, row[0] + 1, row[1])
     stored = batch.take(kept)
-    head = _advance(connection, twin, stored, fate.n_instants, after_all=False)
+    ends = (int(stored.time_us.min()), int(stored.time_us.max()))
+    head = _advance(connection, twin, stored, fate.n_instants, ends, after_all=False)
     if head is None:
         raise TwinGone(f"twin {twin} is gone")
-    _write(connection, twin, stored, head)
-    return Receipt(fate.status, row[0] + 1, max(int(stored.time_us.max()), row[1] or 0))
+    _write(connection, twin, stored, head, ends)
+    return Receipt(fate.status, row[0] + 1, max(ends[1], row[1] or 0))
 
 
 def _advance(
-    connection: Connection, twin: int, batch: Batch, n_instants: int, *, after_all: bool
+    connection: Connection, twin: int, batch: Batch, n_instants: int, ends: tuple[int, int], *, after_all: bool
 ) -> tuple[int, int, int] | None:
-    """Move the head of the archive and return its number, small chunks and small rows.
+    """Move the head of the archive and return its number, small chunks and small rows; ``ends`` are the first and last instant.
 
     With ``after_all`` only if the whole batch comes after everything that is stored; None if not.
     """
     n = int(batch.time_us.size)
-    first_us, last_us = int(batch.time_us.min()), int(batch.time_us.max())
-    small = [size for part in divided(batch.time_us) if (size := batch.time_us[part].size) < SMALL]
+    first_us, last_us = ends
+    whole = quarter_of(first_us) == quarter_of(last_us)
+    sizes = [n] if whole else [batch.time_us[part].size for part in divided(batch.time_us)]
+    small = [size for size in sizes if size < SMALL]
     row: tuple[int, int, int] | None = connection.execute(
         """UPDATE head SET seq = seq + ?, samples = samples + ?,
            first_us = CASE WHEN first_us < ? THEN first_us ELSE ? END,
@@ -138,11 +142,11 @@ def _advance(
     return row
 
 
-def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int, int]) -> None:
+def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int, int], ends: tuple[int, int]) -> None:
     """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
     seq, small_chunks, small_rows = head
     n = int(batch.time_us.size)
-    segments.insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch)
+    segments.insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch, ends)
     if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
         segments.compact(connection, {twin: batch.values.shape[0]})
 

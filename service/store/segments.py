@@ -42,9 +42,20 @@ _INSERT = """INSERT INTO chunk (twin, n, first_us, last_us, last_seq, seq, time,
              VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"""
 
 
-def insert(connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch) -> None:
-    """Store samples, a segment for each quarter; the head of the archive has been moved already."""
-    _outline(connection, _insert(connection, twin, seq, batch))
+def insert(
+    connection: Connection, twin: int, seq: NDArray[np.int64], batch: Batch, ends: tuple[int, int] | None = None
+) -> None:
+    """Store samples, a segment for each quarter; the head of the archive has been moved already.
+
+    ``ends``, where they are known, are the first and last instant; ``seq`` increases then.
+    """
+    if ends is not None and quarter_of(ends[0]) == quarter_of(ends[1]):
+        make_room(connection, [ends[0]])
+        query = _INSERT + " RETURNING id" if batch.time_us.size >= outline.PIECE else _INSERT
+        answer = connection.execute(query, packed(twin, (*ends, int(seq[-1])), seq, batch))
+        _outline(connection, [(batch, answer)])
+    else:
+        _outline(connection, _insert(connection, twin, seq, batch))
 
 
 def make_room(connection: Connection, instants: Iterable[int]) -> None:
