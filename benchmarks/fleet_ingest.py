@@ -56,6 +56,7 @@ def through_the_store(server_url: str, n_twins: int) -> Iterator[Side]:
             database.submit(twins.register, f"s{k}", specification(f"s{k}")).result()
 
         def store(work: Work) -> float:
+            """Return the seconds from the first batch until the last one is acknowledged; AssertionError if one is refused."""
             done, left, errors = threading.Event(), len(work), list[BaseException]()
 
             def acknowledge(result: appending.Receipt, error: BaseException | None) -> None:
@@ -83,6 +84,7 @@ def one_by_one(server_url: str, n_twins: int) -> Iterator[Side]:
     with through_the_store(server_url, n_twins) as usual:
 
         def store(work: Work) -> float:
+            """Return the seconds with the stage closed to batches of any size."""
             limit, appending.STAGED_BYTES = appending.STAGED_BYTES, 0
             try:
                 return usual(work)

@@ -51,7 +51,8 @@ N_FORMS = 4
 """Other forms where the best option acts that are fitted further."""
 
 REVISION_SHARE = 0.25
-"""Share of the time that is left for looking over what was found: what has not been is no answer yet."""
+"""Share of the search's time that is left for looking over what was found: what has not been is no answer yet. A
+search without a deadline is not touched by it."""
 
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""

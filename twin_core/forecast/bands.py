@@ -1,19 +1,21 @@
 """Quantiles of a mixture of Gaussians, and the band in which a whole path stays."""
 
 import numpy as np
+from scipy.optimize.elementwise import find_root
 from scipy.special import ndtr, ndtri
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 
-MOST_STEPS = 60
-CLOSE = 1e-10
-"""A quantile is found once a step is so small a share of the standard deviation."""
+CLOSE = 1e-12
+"""Probability by which a quantile may be missed; far below what rounding of readings could show."""
+ROUNDING = 1e-9
+"""Share of a standard deviation by which the bounds of a quantile are widened: equal members leave nothing between them."""
 AT_ONCE = 2_000_000
 """Terms of the mixture that are evaluated together."""
 
 
 def mixture_quantile(probability: float, std: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Return the quantile of an equal mixture of normal distributions, by Newton's method between bounds that close in.
+    """Return the quantile of an equal mixture of normal distributions, by Chandrupatla's method (SciPy).
 
     Parameters
     ----------
@@ -37,24 +39,14 @@ def mixture_quantile(probability: float, std: FloatArray, deviations: FloatArray
 
 def _quantiles(probability: float, std: FloatArray, means: FloatArray) -> FloatArray:
     """Return the quantile of each mixture, (n,), of means (n_members, n) and a common standard deviation (n,)."""
-    reach = ndtri(probability) * std
-    low, high = means.min(axis=0) + reach, means.max(axis=0) + reach
-    found = np.clip(means.mean(axis=0) + ndtri(probability) * np.hypot(std, means.std(axis=0)), low, high)
-    left = np.arange(std.size)
-    for _ in range(MOST_STEPS):
-        here = found[left]
-        scaled = (here - means[:, left]) / std[left]
-        excess = ndtr(scaled).mean(axis=0) - probability
-        below = excess < 0.0
-        low[left], high[left] = np.where(below, here, low[left]), np.where(below, high[left], here)
-        slope = np.exp(-0.5 * scaled**2).mean(axis=0) / (np.sqrt(2.0 * np.pi) * std[left])
-        newton = here - excess / np.maximum(slope, 1e-300)
-        inside = (newton > low[left]) & (newton < high[left])
-        found[left] = np.where(inside, newton, 0.5 * (low[left] + high[left]))
-        left = left[np.abs(found[left] - here) > CLOSE * std[left]]
-        if left.size == 0:
-            break
-    return found
+    reach, rounding = ndtri(probability) * std, ROUNDING * std
+
+    def excess(here: FloatArray, which: IntArray) -> FloatArray:
+        return np.asarray(ndtr((here - means[:, which]) / std[which]).mean(axis=0) - probability)
+
+    bounds = means.min(axis=0) + reach - rounding, means.max(axis=0) + reach + rounding
+    found = find_root(excess, bounds, args=(np.arange(std.size),), tolerances={"fatol": CLOSE})
+    return np.asarray(found.x)
 
 
 def whole_path_factor(
