@@ -12,7 +12,8 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover.confirm import N_BLOCKS, Trial, blocked_errors, try_effects, validate, weigh
+from twin_core.discover.confirm import Trial, try_effects, validate, weigh
+from twin_core.discover.left_out import N_BLOCKS, blocked_errors
 from twin_core.discover.policy import FORESIGHT
 from twin_core.effects import REGISTRY
 from twin_core.network.spec import TwinSpec
