@@ -1,7 +1,7 @@
 """What assumed inputs missed in the past, over the same horizon, pushed through the balance once more."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -11,7 +11,8 @@ from twin_core.forecast.assumed import Rule
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.rollout import Rollout, rollout
+from twin_core.simulate.rollout import Rollout
+from twin_core.simulate.together import Variants, rollouts
 
 MOST_ORIGINS = 1024
 """Moments of the past that are looked at; the most alike of them are used."""
@@ -131,23 +132,22 @@ def deviations_K(
     Each member is a rollout of its own, so that what saturates, switches or radiates does so. A member whose inputs have
     no solution is left out.
     """
-    spec = network.spec
+    spec, node = network.spec, network.sensor_node
     column = {boundary.channel: i for i, boundary in enumerate(spec.boundaries.values()) if boundary.channel}
-    central = path.at_samples(forcing.sample_step)[:, network.sensor_node]
-    members = []
-    for k in range(found.n_members):
-        inputs, boundaries_K = dict(forcing.inputs), forcing.boundaries_K.copy()
-        for name, error in found.errors.items():
-            if name in inputs:
-                inputs[name] = _possible(spec, name, inputs[name] + error[k], rules[name])
-            if name in column:
-                boundaries_K[:, :, column[name]] += error[k]
-        other = replace(forcing, inputs=inputs, boundaries_K=boundaries_K)
-        moved = rollout(network, values, path.start_K, other, near=path.stages_K)
-        if moved.converged:
-            members.append(moved.at_samples(forcing.sample_step)[:, network.sensor_node] - central)
-    deviations = np.array(members).reshape(len(members), *central.shape)
-    if not members:
+    inputs = {
+        name: _possible(spec, name, forcing.inputs[name] + error, rules[name])
+        for name, error in found.errors.items()
+        if name in forcing.inputs
+    }
+    boundaries_K = {
+        column[name]: forcing.boundaries_K[:, :, column[name]] + error
+        for name, error in found.errors.items()
+        if name in column
+    }
+    variants = Variants(inputs, boundaries_K, found.n_members)
+    members = rollouts(network, values, forcing, path, variants, node)
+    deviations = members[np.isfinite(members).all(axis=(1, 2))] - path.at_samples(forcing.sample_step)[:, node]
+    if not deviations.shape[0]:
         return deviations
     mean = deviations.mean(axis=0)
     return np.asarray(mean + found.widening * (deviations - mean))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin_core._typing import FloatArray, IntArray
+from twin_core._typing import Float32Array, FloatArray, IntArray
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.base import Beyond
 from twin_core.network.model import Network
@@ -36,13 +36,13 @@ class Spread:
         Noise included.
     kept : (n_kept,)
         Instants at which paths are drawn, evenly among those wanted.
-    paths_K : (DRAWS, n_kept, n_sensors)
-        Paths about the rollout, noise not included.
+    paths_K : (n_kept, n_sensors, DRAWS)
+        Paths about the rollout, noise not included: each sensor's are drawn rightly, what two have in common is not.
     """
 
     variance_K2: FloatArray
     kept: IntArray
-    paths_K: FloatArray
+    paths_K: Float32Array
 
 
 def spread(
@@ -77,23 +77,36 @@ def spread(
     stride = 1 + wanted.size * n_sensors * DRAWS // MOST_DRAWN
     kept = wanted[stride - 1 :: stride] if wanted.size >= stride else wanted[-1:]
     rng = np.random.default_rng(0)
-    drawn = _root(covariance) @ rng.standard_normal((covariance.shape[0], DRAWS))
+    drawn = (_root(covariance) @ rng.standard_normal((covariance.shape[0], DRAWS))).astype(np.float32)
     misfit = np.array([model.misfit_K[s] for s in model.spec.sensors])
     length = np.maximum(np.array([model.misfit_length_s[s] for s in model.spec.sensors]), 1e-9)
     lead = time_s - time_s[0]
-    now_K = misfit[:, None] * rng.standard_normal((n_sensors, DRAWS))
-    variances, lines = [], []
+    now_K = (misfit[:, None] * rng.standard_normal((n_sensors, DRAWS))).astype(np.float32)
+    variance = np.empty((time_s.size, n_sensors))
+    paths = np.empty((kept.size, n_sensors, DRAWS), dtype=np.float32)
+    done = 0
     for window, block in sensitivities(network, network.parameters.values, forcing, path, starts, network.sensor_node):
-        left = _misfit_left(network, block[:, :, n_free:], np.exp(-lead[window, None] / length))
-        variances.append(((block @ covariance) * block).sum(axis=-1) + left**2 @ misfit**2)
+        variance[window] = ((block @ covariance) * block).sum(axis=-1)
         inside = kept[(kept >= window.start) & (kept < window.stop)] - window.start
-        lines.append(block[inside] @ drawn + left[inside] @ now_K)
-    paths = np.concatenate(lines).transpose(2, 0, 1)
+        lines = paths[done : done + inside.size]
+        done += inside.size
+        np.matmul(_rows(block[inside]), drawn, out=lines.reshape(-1, DRAWS))
+        if misfit.any():
+            left = _misfit_left(network, block[:, :, n_free:], np.exp(-lead[window, None] / length))
+            variance[window] += left**2 @ misfit**2
+            lines += left[inside].astype(np.float32) @ now_K
     outside = extrapolated_variance_K2(network, beyond, forcing, path, network.sensor_node)
-    paths += rng.standard_normal((DRAWS, 1, 1)) * np.sqrt(outside[kept])
-    paths += _misfit_paths(rng, misfit, length, lead[kept])
+    if outside.any():
+        paths += np.sqrt(outside[kept], dtype=np.float32)[:, :, None] * rng.standard_normal(DRAWS, dtype=np.float32)
+    if misfit.any():
+        _add_misfit(paths, rng, misfit, length, lead[kept])
     grown = misfit**2 * (1.0 - np.exp(-2.0 * lead[:, None] / length))
-    return Spread(np.concatenate(variances) + outside + grown + model.noise_vector_K() ** 2, kept, paths)
+    return Spread(variance + outside + grown + model.noise_vector_K() ** 2, kept, paths)
+
+
+def _rows(block: FloatArray) -> Float32Array:
+    """Return (..., n_columns) as rows."""
+    return block.reshape(-1, block.shape[-1]).astype(np.float32)
 
 
 def _misfit_left(network: Network, by_start: FloatArray, faded: FloatArray) -> FloatArray:
@@ -112,12 +125,16 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _misfit_paths(rng: np.random.Generator, std: FloatArray, length_s: FloatArray, lead_s: FloatArray) -> FloatArray:
-    """Return Ornstein-Uhlenbeck paths that start from zero, (DRAWS, n_times, n_sensors)."""
+def _add_misfit(
+    paths_K: Float32Array, rng: np.random.Generator, std: FloatArray, length_s: FloatArray, lead_s: FloatArray
+) -> None:
+    """Add Ornstein-Uhlenbeck paths that start from zero, all sensors' of the same shocks."""
     keep = np.exp(-np.diff(lead_s, prepend=0.0)[:, None] / length_s)
-    shocks = rng.standard_normal((lead_s.size, DRAWS, std.size)) * (std * np.sqrt(1.0 - keep**2))[:, None, :]
-    now = np.zeros((DRAWS, std.size))
+    size = (std * np.sqrt(1.0 - keep**2)).astype(np.float32)[:, :, None]
+    kept_share = keep.astype(np.float32)[:, :, None]
+    shocks = rng.standard_normal((lead_s.size, DRAWS), dtype=np.float32)
+    now = np.zeros((std.size, DRAWS), dtype=np.float32)
     for k in range(lead_s.size):
-        now = keep[k] * now + shocks[k]
-        shocks[k] = now
-    return shocks.transpose(1, 0, 2)
+        now *= kept_share[k]
+        now += size[k] * shocks[k]
+        paths_K[k] += now

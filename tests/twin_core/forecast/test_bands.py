@@ -29,14 +29,14 @@ def test_a_band_that_holds_n_independent_readings(n_kept: int, n_between: float)
     z, noise = norm.ppf(0.95), np.array([0.3, 2.0])
     edge = np.broadcast_to(z * noise, (n_kept, 2))
     bands = (-edge, np.zeros_like(edge), edge)
-    found = whole_path_factor(0.9, np.zeros((20_000, n_kept, 2)), np.zeros((0, n_kept, 2)), noise, n_between, bands)
+    found = whole_path_factor(0.9, np.zeros((n_kept, 2, 20_000), np.float32), np.zeros((0, n_kept, 2)), noise, n_between, bands)
     share = 0.9 ** (1.0 / (n_kept * n_between))
     np.testing.assert_allclose(found, norm.ppf(0.5 + 0.5 * share) / z, rtol=0.01)
 
 
 def test_a_path_that_moves_as_one_needs_no_wider_band() -> None:
     """One number for the whole path: what holds at one time holds at all."""
-    paths = np.broadcast_to(np.random.default_rng(0).standard_normal((20_000, 1, 1)), (20_000, 50, 1))
+    paths = np.broadcast_to(np.random.default_rng(0).standard_normal(20_000, np.float32), (50, 1, 20_000))
     edge = np.full((50, 1), norm.ppf(0.95))
     bands = (-edge, np.zeros_like(edge), edge)
     found = whole_path_factor(0.9, np.array(paths), np.zeros((0, 50, 1)), np.array([1e-9]), 1.0, bands)
