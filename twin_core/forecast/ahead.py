@@ -122,23 +122,23 @@ def forecast(
     beyond = extrapolations(network, model.effects, forcing, path)
     about = spread(model, network, forcing, path, covariance_K2, future.time_s, wanted, [b for _, b in beyond])
     found = missed(assumed.rules, now_s, forcing)
-    moved = np.zeros((0, future.time_s.size, network.sensor_node.size))
+    moved = np.zeros((0, wanted.size, network.sensor_node.size))
     if found is not None:
-        moved = deviations_K(network, values, forcing, path, assumed.rules, found)
-    std, here, at = np.sqrt(about.variance_K2)[wanted], read[wanted], moved[:, wanted]
-    bands = {q: mixture_quantile(q, std, at) for q in {*quantiles, *_BAND}}
-    kept = np.searchsorted(wanted, about.kept)
+        moved = deviations_K(network, values, forcing, path, assumed.rules, found, wanted)
+    std, here = np.sqrt(about.variance_K2), read[wanted]
+    bands = {q: mixture_quantile(q, std, moved) for q in {*quantiles, *_BAND}}
+    kept = about.kept
     low, middle, high = (bands[q] for q in _BAND)
     factor = whole_path_factor(
         WHOLE,
         about.paths_K,
-        moved[:, about.kept],
+        moved[:, kept],
         model.noise_vector_K(),
         wanted.size / kept.size,
         (low[kept], middle[kept], high[kept]),
     )
     whole = here + middle - factor * (middle - low), here + middle + factor * (high - middle)
-    mean = here + at.mean(axis=0) if at.shape[0] else here
+    mean = here + moved.mean(axis=0) if moved.shape[0] else here
     short = () if found is None else _short(found, horizon_s)
     notices = (*orbit_notices(model.spec, [future]), *assumed.in_words(), *short, *in_words(beyond))
     made = {q: here + bands[q] for q in quantiles}

@@ -1,5 +1,7 @@
 """Quantiles of a mixture of Gaussians, and the band in which a whole path stays."""
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 from scipy.special import ndtr, ndtri
@@ -8,6 +10,8 @@ from twin_core._typing import Float32Array, FloatArray
 
 CLOSE = 1e-10
 """Share of a standard deviation by which a quantile may be missed."""
+NEAR = 1e-4
+"""A step of Halley's method shorter than this leaves an error of its third power, about."""
 SURE = 8.3
 """Standard deviations beyond which a normal distribution is 0 or 1 to rounding."""
 NODES_PER_STD = 128
@@ -16,6 +20,9 @@ _GRID = np.arange(-SURE - 1.0, SURE + 1.0, 1.0 / NODES_PER_STD)
 _BELOW, _DENSITY = ndtr(_GRID), np.exp(-0.5 * _GRID**2) / np.sqrt(2.0 * np.pi)
 MOST_HALVINGS = 200
 """Steps to a quantile: from any bracket halving comes down to rounding in half as many."""
+
+KEPT_ROWS = 1024
+"""So many instants' drawn numbers are kept, 2 MB: drawing them again gives the same."""
 
 
 def mixture_quantile(probability: float, std: FloatArray, deviations: FloatArray) -> FloatArray:
@@ -41,6 +48,29 @@ def mixture_quantile(probability: float, std: FloatArray, deviations: FloatArray
 
 
 @njit(cache=True, nogil=True)
+def _mixture(
+    x: float, means: FloatArray, inverse: float, below: FloatArray, density: FloatArray
+) -> tuple[float, float, float]:
+    """Return the sums over members of Phi, phi and phi' at (x - mean) * inverse, by Taylor's series from the tables."""
+    total, slope, bend = 0.0, 0.0, 0.0
+    for m in range(means.size):
+        at = (x - means[m]) * inverse
+        if at >= SURE:
+            total += 1.0
+        elif at > -SURE:
+            place = (at + (SURE + 1.0)) * NODES_PER_STD
+            node = int(place + 0.5)
+            d = (place - node) / NODES_PER_STD
+            y, dd = at - d, d * d
+            third = y * (y * y - 3.0) * dd * d
+            total += below[node] + density[node] * d * (1.0 - y * d / 2.0 + (y * y - 1.0) * dd / 6.0 - third / 24.0)
+            near = density[node] * (1.0 - y * d + (y * y - 1.0) * dd / 2.0 - third / 6.0)
+            slope += near
+            bend -= at * near
+    return total, slope, bend
+
+
+@njit(cache=True, nogil=True)
 def _quantiles(
     probability: float,
     z: float,
@@ -52,54 +82,36 @@ def _quantiles(
 ) -> None:
     """Write the quantiles of mixtures of means (n, n_times, n_members) and std (n, n_times) to ``out``, (n, n_times).
 
-    Each begins where the one before suggests. ``z`` is the normal quantile.
+    Each search begins where the two quantiles before point to. ``z`` is the normal quantile.
     """
     n_members = means.shape[2]
     for i in range(std.shape[0]):
+        before, ahead = z, z
         for k in range(std.shape[1]):
             own, size = means[i, k], std[i, k]
-            centre = own.mean()
-            low, high = own.min() + z * size, own.max() + z * size
-            x = centre + z * size
-            if k > 0:
-                x = centre + (out[i, k - 1] - means[i, k - 1].mean()) * size / std[i, k - 1]
-            x = min(max(x, low), high)
+            centre, low, high = own.mean(), own.min() + z * size, own.max() + z * size
+            x = min(max(centre + ahead * size, low), high)
             moved = high - low
             for _ in range(MOST_HALVINGS):
-                total, slope, bend = 0.0, 0.0, 0.0
-                for m in range(n_members):
-                    at = (x - own[m]) / size
-                    if at >= SURE:
-                        total += 1.0
-                    elif at > -SURE:
-                        place = (at + (SURE + 1.0)) * NODES_PER_STD
-                        node = int(place + 0.5)
-                        d = (place - node) / NODES_PER_STD
-                        y, p = at - d, density[node]
-                        first, second = y * d, (y * y - 1.0) * d * d
-                        total += below[node] + p * d * (1.0 - first / 2.0 + second / 6.0 - y * (y * y - 3.0) * d**3 / 24.0)
-                        near = p * (1.0 - first + second / 2.0 - y * (y * y - 3.0) * d**3 / 6.0)
-                        slope += near
-                        bend -= at * near
+                total, slope, bend = _mixture(x, own, 1.0 / size, below, density)
                 excess = total / n_members - probability
                 if excess > 0.0:
                     high = x
                 else:
                     low = x
-                # Newton's step, bent (Halley); half the bracket where it leaves that or gains little
-                step = np.inf
+                step, close = np.inf, NEAR
                 if slope > 0.0:
-                    step = -excess * n_members / slope
-                    step /= max(1.0 + 0.5 * step * bend / slope, 0.5)
-                step *= size
+                    newton = -excess * n_members / slope
+                    step = size * newton / max(1.0 + 0.5 * newton * bend / slope, 0.5)
                 if not (low <= x + step <= high) or abs(step) > 0.5 * abs(moved):
-                    step = 0.5 * (low + high) - x
+                    step, close = 0.5 * (low + high) - x, CLOSE
                 x += step
-                # its error is of third order in the step: this one was the last but for rounding
-                if abs(step) <= CLOSE * size or (abs(step) < 1e-4 * size and abs(moved) < 1e-2 * size):
+                if abs(step) <= close * size:
                     break
                 moved = step
             out[i, k] = x
+            here = (x - centre) / size
+            before, ahead = here, 2.0 * here - before if k > 0 else here
 
 
 def whole_path_factor(
@@ -128,18 +140,35 @@ def whole_path_factor(
         Low, middle and high, (n_kept, n_sensors) each, about the rollout.
     """
     n_kept, n_sensors, n_draws = paths_K.shape
-    rng = np.random.default_rng(1)
-    if n_between > 1.0:
-        up, down = (ndtri(rng.random((n_kept, n_draws)) ** (1.0 / n_between)).astype(np.float32) for _ in range(2))
-    else:  # one reading: how far it lies above is how far it does not lie below
-        up = rng.standard_normal((n_kept, n_draws), dtype=np.float32)
-        down = -up
+    up, down = _noises(n_kept, n_draws, n_between)
     members = deviations_K if deviations_K.shape[0] else np.zeros((1, n_kept, n_sensors))
     own = np.ascontiguousarray(members.transpose(1, 2, 0), dtype=np.float32)
     low, middle, high = (band.astype(np.float32) for band in bands_K)
     worst = np.full((n_sensors, n_draws), -np.inf, dtype=np.float32)
     _widest(paths_K, own, noise_K.astype(np.float32), up, down, low, middle, high, worst)
     return np.maximum(np.quantile(worst, probability, axis=1), 1.0)
+
+
+def _noises(n_kept: int, n_draws: int, n_between: float) -> tuple[Float32Array, Float32Array]:
+    """Return by how many standard deviations the largest of so many noises lies above, and one below, (n_kept, n_draws)."""
+    if n_between <= 1.0:  # one reading: how far it lies above is how far it does not lie below
+        noise = normals(1, n_kept, n_draws)
+        return noise, -noise
+    rng = np.random.default_rng(1)
+    up, down = (ndtri(rng.random((n_kept, n_draws)) ** (1.0 / n_between)).astype(np.float32) for _ in range(2))
+    return up, down
+
+
+def normals(seed: int, n_rows: int, n_columns: int) -> Float32Array:
+    """Return standard normal numbers, (n_rows, n_columns): the same ones for a seed, whatever the number of rows."""
+    if n_rows <= KEPT_ROWS:
+        return _kept_normals(seed, n_columns)[:n_rows]
+    return np.random.default_rng(seed).standard_normal((n_rows, n_columns), dtype=np.float32)
+
+
+@lru_cache(maxsize=2)
+def _kept_normals(seed: int, n_columns: int) -> Float32Array:
+    return np.random.default_rng(seed).standard_normal((KEPT_ROWS, n_columns), dtype=np.float32)
 
 
 @njit(cache=True, nogil=True)

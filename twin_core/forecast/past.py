@@ -125,9 +125,15 @@ def _errors(rule: Rule, origins: FloatArray, lead_s: FloatArray, known_s: float)
 
 
 def deviations_K(
-    network: Network, values: FloatArray, forcing: Forcing, path: Rollout, rules: Mapping[str, Rule], found: Missed
+    network: Network,
+    values: FloatArray,
+    forcing: Forcing,
+    path: Rollout,
+    rules: Mapping[str, Rule],
+    found: Missed,
+    wanted: IntArray,
 ) -> FloatArray:
-    """Return how the observed states of each member differ from those of the forecast, (n_members, n_samples, n_sensors).
+    """Return how the observed states of each member differ from those of the forecast, (n_members, n_wanted, n_sensors).
 
     Each member is a rollout of its own, so that what saturates, switches or radiates does so. A member whose inputs have
     no solution is left out.
@@ -145,8 +151,9 @@ def deviations_K(
         if name in column
     }
     variants = Variants(inputs, boundaries_K, found.n_members)
-    members = rollouts(network, values, forcing, path, variants, node)
-    deviations = members[np.isfinite(members).all(axis=(1, 2))] - path.at_samples(forcing.sample_step)[:, node]
+    after = forcing.sample_step[wanted]
+    members = rollouts(network, values, forcing, path, variants, node, after)
+    deviations = members[np.isfinite(members[:, -1]).all(axis=1)] - path.at_samples(after)[:, node]
     if not deviations.shape[0]:
         return deviations
     mean = deviations.mean(axis=0)

@@ -7,13 +7,14 @@ first, and the whole misfit once the start is forgotten, however slowly M itself
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from twin_core._typing import Float32Array, FloatArray, IntArray
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.base import Beyond
+from twin_core.forecast.bands import normals
 from twin_core.network.model import Network
 from twin_core.simulate.extrapolation import extrapolated_variance_K2
 from twin_core.simulate.forcing import Forcing
@@ -32,10 +33,10 @@ class Spread:
 
     Attributes
     ----------
-    variance_K2 : (n_times, n_sensors)
+    variance_K2 : (n_wanted, n_sensors)
         Noise included.
     kept : (n_kept,)
-        Instants at which paths are drawn, evenly among those wanted.
+        Instants at which paths are drawn, evenly among those wanted: positions there.
     paths_K : (n_kept, n_sensors, DRAWS)
         Paths about the rollout, noise not included: each sensor's are drawn rightly, what two have in common is not.
     """
@@ -75,14 +76,15 @@ def spread(
         covariance[:n_free, :n_free] = model.covariance
     covariance[n_free:, n_free:] = state_covariance_K2
     stride = 1 + wanted.size * n_sensors * DRAWS // MOST_DRAWN
-    kept = wanted[stride - 1 :: stride] if wanted.size >= stride else wanted[-1:]
+    kept = np.arange(wanted.size)[min(stride, wanted.size) - 1 :: stride]
     rng = np.random.default_rng(0)
     drawn = (_root(covariance) @ rng.standard_normal((covariance.shape[0], DRAWS))).astype(np.float32)
     misfit = np.array([model.misfit_K[s] for s in model.spec.sensors])
     length = np.maximum(np.array([model.misfit_length_s[s] for s in model.spec.sensors]), 1e-9)
-    lead = time_s - time_s[0]
+    lead = time_s[wanted] - time_s[0]
+    forcing = replace(forcing, sample_step=forcing.sample_step[wanted])
     now_K = (misfit[:, None] * rng.standard_normal((n_sensors, DRAWS))).astype(np.float32)
-    variance = np.empty((time_s.size, n_sensors))
+    variance = np.empty((wanted.size, n_sensors))
     paths = np.empty((kept.size, n_sensors, DRAWS), dtype=np.float32)
     done = 0
     for window, block in sensitivities(network, network.parameters.values, forcing, path, starts, network.sensor_node):
@@ -99,7 +101,7 @@ def spread(
     if outside.any():
         paths += np.sqrt(outside[kept], dtype=np.float32)[:, :, None] * rng.standard_normal(DRAWS, dtype=np.float32)
     if misfit.any():
-        _add_misfit(paths, rng, misfit, length, lead[kept])
+        _add_misfit(paths, misfit, length, lead[kept])
     grown = misfit**2 * (1.0 - np.exp(-2.0 * lead[:, None] / length))
     return Spread(variance + outside + grown + model.noise_vector_K() ** 2, kept, paths)
 
@@ -125,14 +127,12 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(vectors * np.sqrt(np.maximum(size, 0.0)))
 
 
-def _add_misfit(
-    paths_K: Float32Array, rng: np.random.Generator, std: FloatArray, length_s: FloatArray, lead_s: FloatArray
-) -> None:
+def _add_misfit(paths_K: Float32Array, std: FloatArray, length_s: FloatArray, lead_s: FloatArray) -> None:
     """Add Ornstein-Uhlenbeck paths that start from zero, all sensors' of the same shocks."""
     keep = np.exp(-np.diff(lead_s, prepend=0.0)[:, None] / length_s)
     size = (std * np.sqrt(1.0 - keep**2)).astype(np.float32)[:, :, None]
     kept_share = keep.astype(np.float32)[:, :, None]
-    shocks = rng.standard_normal((lead_s.size, DRAWS), dtype=np.float32)
+    shocks = normals(2, lead_s.size, DRAWS)
     now = np.zeros((std.size, DRAWS), dtype=np.float32)
     for k in range(lead_s.size):
         now *= kept_share[k]

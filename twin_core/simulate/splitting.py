@@ -85,10 +85,11 @@ class Couplings:
         return self.linear_W_per_K + 4.0 * self.fourth_W_per_K4 * about_K**3
 
 
-def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
+def couplings(network: Network, values: FloatArray, along: Along, *, driven: bool = False) -> Couplings:
     """Return the couplings of a network; ``along`` has two points at least, with one temperature per node.
 
-    What reads a boundary that follows a state is none of them: it is evaluated along the trajectory.
+    What reads a boundary that follows a state is none of them: it is evaluated along the trajectory. ``driven`` leaves out
+    the terms between nodes, which read nothing but temperatures.
     """
     around = surround(network, values, along)
     n_points, n = along.temperatures_K.shape
@@ -96,6 +97,8 @@ def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
     everywhere = tuple(range(n))
     relays, others = [], []
     for position, (term, index) in enumerate(zip(network.terms, network.term_indices, strict=True)):
+        if driven and isinstance(term, Conductors | NodeRadiation):
+            continue
         part = term.evaluate(around.along, values[index])
         if part.relay is not None:
             relays.append((position, part.relay))
@@ -120,6 +123,15 @@ def couplings(network: Network, values: FloatArray, along: Along) -> Couplings:
             matrix[np.ix_(part.nodes, part.nodes)] += slope
             heat[:, part.nodes] += part.heat_W
     return Couplings(linear, fourth, heat, tuple(relays), tuple(others))
+
+
+def _standing(
+    network: Network, values: FloatArray, forcing: Forcing, first: int, last: int, about_K: FloatArray
+) -> Along:
+    """Return the ends of steps first..last-1, all at the same temperatures."""
+    boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
+    points = np.broadcast_to(about_K, (2 * (last - first), about_K.size))
+    return replace(forcing.along(points, boundaries, first, last), derivatives=False)
 
 
 def probe(network: Network, values: FloatArray, forcing: Forcing, about_K: FloatArray) -> Along:
@@ -192,10 +204,20 @@ class Split:
                 about_K,
                 couplings(network, values, probe(network, values, forcing, about_K)),
             )
-        boundaries = fill_boundaries(network, values, forcing.boundaries_flat_K(first, last))
-        points = np.broadcast_to(about_K, (2 * (last - first), about_K.size))
-        along = replace(forcing.along(points, boundaries, first, last), derivatives=False)
+        along = _standing(network, values, forcing, first, last, about_K)
         return cls(network, values, forcing, first, last, about_K, couplings(network, values, along))
+
+    def given_by(self, forcing: Forcing) -> FloatArray | None:
+        """Return the rates that no temperature changes under a forcing of other steps, (n_steps, 2, n_nodes).
+
+        None where not every term is a coupling: then these are not all of them.
+        """
+        along = _standing(self.network, self.values, forcing, 0, forcing.n_steps, self.about_K)
+        parts = couplings(self.network, self.values, along, driven=True)
+        if parts.others or parts.relays or self.network.capacities:
+            return None
+        mine = parts.linear_W_per_K @ self.about_K + parts.fourth_W_per_K4 @ self.about_K**4
+        return np.asarray((parts.heat_W - mine) / self.own_J_per_K).reshape(forcing.n_steps, 2, -1)
 
     @cached_property
     def own_J_per_K(self) -> FloatArray:

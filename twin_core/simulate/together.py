@@ -24,6 +24,8 @@ N_FIXED = 20
 """Iterations of a step: contracting by less than a third, as few do, they reach the rounding of a temperature."""
 MOST_VALUES = 2_000_000
 """Rates of members that are held at once, 16 MB; more members go in groups."""
+MOST_EVALUATED = 100_000
+"""Rates that are evaluated at once: what a core's cache holds."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +67,15 @@ class Variants:
 
 
 def rollouts(
-    network: Network, values: FloatArray, forcing: Forcing, near: Rollout, variants: Variants, observed: IntArray
+    network: Network,
+    values: FloatArray,
+    forcing: Forcing,
+    near: Rollout,
+    variants: Variants,
+    observed: IntArray,
+    after: IntArray,
 ) -> FloatArray:
-    """Return the observed states of each member at the samples, (n_members, n_samples, n_observed).
+    """Return the observed states of each member after some steps.
 
     Parameters
     ----------
@@ -79,33 +87,36 @@ def rollouts(
         What each member has instead.
     observed : (n_observed,)
         States wanted.
+    after : (n_wanted,)
+        Steps taken before each instant that is wanted.
 
     Returns
     -------
-    (n_members, n_samples, n_observed)
+    (n_members, n_wanted, n_observed)
         NaN from where a member has no solution.
     """
-    found = np.empty((variants.n_members, forcing.sample_step.size, observed.size))
+    found = np.empty((variants.n_members, after.size, observed.size))
     most = max(1, MOST_VALUES // max(2 * min(forcing.n_steps, STRETCH) * near.start_K.size, 1))
     for first in range(0, variants.n_members, most):
         members = slice(first, min(first + most, variants.n_members))
         some = variants.part(members, slice(None))
         ends_K = _at_once(network, values, forcing, near, some, observed)
         if ends_K is None:
-            found[members] = list(_one_by_one(network, values, forcing, near, some, observed))
+            for k, states_K in enumerate(_one_by_one(network, values, forcing, near, some)):
+                found[first + k] = states_K[after][:, observed]
         else:
-            found[members] = ends_K[forcing.sample_step].transpose(2, 0, 1)
+            found[members] = ends_K[after].transpose(2, 0, 1)
     return found
 
 
 def _one_by_one(
-    network: Network, values: FloatArray, forcing: Forcing, near: Rollout, variants: Variants, observed: IntArray
+    network: Network, values: FloatArray, forcing: Forcing, near: Rollout, variants: Variants
 ) -> Iterator[FloatArray]:
-    """Yield each member's observed states at the samples."""
+    """Yield each member's states before the first and after each step, (n_steps + 1, n_nodes)."""
     for k in range(variants.n_members):
         other = variants.part(slice(k, k + 1), slice(None)).one_after_another(forcing)
         moved = rollout(network, values, near.start_K, other, near=near.stages_K)
-        yield moved.at_samples(forcing.sample_step)[:, observed]
+        yield moved.at_samples(np.arange(forcing.n_steps + 1))
 
 
 def _at_once(
@@ -114,7 +125,7 @@ def _at_once(
     """Return the observed states before the first and after each step, (n_steps + 1, n_observed, n_members); None if not so."""
     if network.capacities:
         return None
-    n_members, n_nodes = variants.n_members, near.start_K.size
+    n_members = variants.n_members
     out = np.empty((forcing.n_steps + 1, observed.size, n_members))
     out[0] = near.start_K[observed, None]
     state, about_K = np.tile(near.start_K[:, None], (1, n_members)), None
@@ -130,16 +141,29 @@ def _at_once(
             inputs={name: series[steps] for name, series in forcing.inputs.items()},
             sun_factor=forcing.sun_factor[steps],
         )
-        all_steps = variants.part(slice(None), steps).one_after_another(here)
-        split = Split.at(network, values, all_steps, 0, all_steps.n_steps, about_K)
-        if split.others or split.parts.relays:
+        split = Split.at(network, values, here, 0, here.n_steps, about_K)
+        given = _given(split, variants.part(slice(None), steps))
+        if given is None:
             return None
-        left, given = split.remainder(None, near.stages_K[:0], 0, all_steps.n_steps)
-        together = np.ascontiguousarray(given.reshape(n_members, last - first, 2, n_nodes).transpose(1, 2, 3, 0))
-        n_solved = _march(here.step_s, split.modes, left, together, state, observed, *LIMIT_K, out[first + 1 : last + 1])
+        left, _ = split.remainder(None, near.stages_K[:0], 0, here.n_steps)
+        n_solved = _march(here.step_s, split.modes, left, given, state, observed, *LIMIT_K, out[first + 1 : last + 1])
         if n_solved < last - first:
             return None
     return out
+
+
+def _given(split: Split, variants: Variants) -> FloatArray | None:
+    """Return the rates of each member that no temperature changes, (n_members, n_steps, 2, n_nodes); None where others are."""
+    n_steps, n_members = split.forcing.n_steps, variants.n_members
+    given = np.empty((n_members, n_steps, 2, split.about_K.size))
+    most = max(1, MOST_EVALUATED // given[0].size)
+    for first in range(0, n_members, most):
+        some = variants.part(slice(first, first + most), slice(None))
+        rates = split.given_by(some.one_after_another(split.forcing))
+        if rates is None:
+            return None
+        given[first : first + most] = rates.reshape(some.n_members, n_steps, 2, -1)
+    return given
 
 
 @njit(cache=True, nogil=True)
@@ -171,13 +195,14 @@ def _march(
 ) -> int:
     """Advance the states of all members, (n, n_members), as ``kernels.march`` does those of one; return how many steps rest.
 
-    ``given`` is (n_steps, 2, n, n_members); the observed ends go to ``out``, (n_steps, n_observed, n_members).
+    ``given`` is (n_members, n_steps, 2, n); the observed ends go to ``out``, (n_steps, n_observed, n_members).
     """
     n, n_members = state.shape
     keep, whole, late = np.empty(n), np.empty(n), np.empty(n)
     mode, pushed, right = np.empty((n, n_members)), np.empty((n, n_members)), np.empty((n, n_members))
     base, ahead, moved = np.empty((n, n_members)), np.empty((n, n_members)), np.zeros((n, n_members))
     multiply_columns(modes.inward, state, mode)
+    here = np.empty((2, n, n_members))
     at_s, before_s = np.nan, 0.0
     for k in range(step_s.size):
         share = step_s[k] / before_s if k > 0 else 0.0
@@ -185,7 +210,10 @@ def _march(
         if step_s[k] != at_s:
             at_s = step_s[k]
             weights(at_s, modes.rate_per_s, keep, whole, late)
-        _push(left, given[k, 0], state, right)
+        for m in range(n_members):
+            for i in range(n):
+                here[0, i, m], here[1, i, m] = given[m, k, 0, i], given[m, k, 1, i]
+        _push(left, here[0], state, right)
         multiply_columns(modes.inward, right, pushed)
         for i in range(n):
             for m in range(n_members):
@@ -193,7 +221,7 @@ def _march(
                 ahead[i, m] = state[i, m] + share * moved[i, m]
         change, settled = 0.0, False
         for _ in range(N_FIXED):
-            _push(left, given[k, 1], ahead, right)
+            _push(left, here[1], ahead, right)
             multiply_columns(modes.inward, right, pushed)
             for i in range(n):
                 for m in range(n_members):

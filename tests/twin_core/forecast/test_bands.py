@@ -18,6 +18,16 @@ def test_quantiles_of_a_mixture(probability: float) -> None:
         assert found[at] == pytest.approx(brentq(below, -50.0, 50.0, xtol=1e-12), abs=1e-8)
 
 
+def test_quantiles_of_members_far_apart_and_of_equal_ones() -> None:
+    """Between clusters a quantile is flat: anywhere there will do, and the search comes to an end."""
+    deviations = np.concatenate([np.zeros((24, 400)), np.full((24, 400), 1e4)])[:, :, None]
+    deviations[:, 200:] = 7.0
+    std = np.geomspace(1e-6, 1e3, 400)[:, None]
+    for probability in (0.05, 0.5, 0.51, 0.95):
+        found = mixture_quantile(probability, std, deviations)
+        np.testing.assert_allclose(norm.cdf((found - deviations) / std).mean(axis=0), probability, atol=1e-9)
+
+
 def test_without_members_it_is_the_normal_quantile() -> None:
     std = np.array([[0.5], [2.0]])
     np.testing.assert_allclose(mixture_quantile(0.95, std, np.zeros((0, 2, 1))), norm.ppf(0.95) * std)
@@ -29,7 +39,9 @@ def test_a_band_that_holds_n_independent_readings(n_kept: int, n_between: float)
     z, noise = norm.ppf(0.95), np.array([0.3, 2.0])
     edge = np.broadcast_to(z * noise, (n_kept, 2))
     bands = (-edge, np.zeros_like(edge), edge)
-    found = whole_path_factor(0.9, np.zeros((n_kept, 2, 20_000), np.float32), np.zeros((0, n_kept, 2)), noise, n_between, bands)
+    found = whole_path_factor(
+        0.9, np.zeros((n_kept, 2, 20_000), np.float32), np.zeros((0, n_kept, 2)), noise, n_between, bands
+    )
     share = 0.9 ** (1.0 / (n_kept * n_between))
     np.testing.assert_allclose(found, norm.ppf(0.5 + 0.5 * share) / z, rtol=0.01)
 
