@@ -119,10 +119,10 @@ class Server:
             self.process.wait()
 
     def memory_MB(self) -> float:
-        """Return the resident memory of the server's process."""
+        """Return the memory of the server's process: its own, without the pages of files that the kernel takes back."""
         assert self.process is not None
         status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(status.split("VmRSS:")[1].split()[0]) / 1024
+        return int(status.split("RssAnon:")[1].split()[0]) / 1024
 
 
 @dataclass

@@ -97,6 +97,10 @@ class Pulse:
         """Whether every channel has been heard often enough to tell its interval."""
         return all(len(known) >= RECENT for known in self._instants_us)
 
+    def may_learn(self, last_us: int) -> bool:
+        """Whether samples up to an instant can tell anything that is not known."""
+        return not self.is_complete or last_us > min(known[0] for known in self._instants_us)
+
     def beats(self) -> list[Beat]:
         """Return what is known of each channel, in their order."""
         if self._beats is None:
@@ -130,7 +134,7 @@ def brought_up(connection: Connection, twin: int, n_channels: int, known: Pulse 
     revision, seq = samples.revision(connection, twin), samples.latest_seq(connection, twin)
     pulse = known if known is not None and known.revision == revision else Pulse(n_channels, revision)
     looked = 0
-    for batch in samples.newest_first(connection, twin, n_channels, pulse.seq):
+    for batch in samples.newest_first(connection, twin, n_channels, pulse.seq, pulse.may_learn):
         pulse.hear(batch)
         looked += int(batch.time_us.size)
         if pulse.seq < 0 and (pulse.is_complete or looked >= MOST):

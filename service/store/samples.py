@@ -1,6 +1,6 @@
 """Samples as they are read: segments found by time or by their numbers in the stream, joined in the order of time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,11 +178,19 @@ def newest(connection: Connection, twin: int, n_channels: int, count: int) -> Sa
     return Samples(held.time_us[-count:], held.values[:, -count:])
 
 
-def newest_first(connection: Connection, twin: int, n_channels: int, after_seq: int) -> Iterator[Batch]:
-    """Yield the chunks with samples that came after a stream number, those that end latest first."""
-    query = """SELECT time, value, received FROM chunk WHERE twin = ? AND last_seq > ? ORDER BY last_us DESC"""
-    for blobs in connection.execute(query, (twin, after_seq)):
-        yield unpack(n_channels, *blobs)
+def newest_first(
+    connection: Connection, twin: int, n_channels: int, after_seq: int, is_wanted: Callable[[int], bool]
+) -> Iterator[Batch]:
+    """Yield the chunks with samples that came after a stream number, those that end latest first, one in memory at a time.
+
+    ``is_wanted`` is asked with the last instant of each chunk before it is read; with the first one that is not, they end.
+    """
+    places = "SELECT id, first_us, last_us FROM chunk WHERE twin = ? AND last_seq > ? ORDER BY last_us DESC"
+    query = "SELECT time, value, received FROM chunk WHERE id = ? AND first_us = ?"
+    for chunk, first_us, last_us in connection.execute(places, (twin, after_seq)):
+        if not is_wanted(last_us):
+            return
+        yield unpack(n_channels, *connection.execute(query, (chunk, first_us)).fetchone())
 
 
 MOST_SEARCHED = 256

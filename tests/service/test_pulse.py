@@ -118,3 +118,19 @@ def test_readings_that_repeat_are_a_sign(make_client) -> None:
 def test_where_nobody_noted_the_reception_a_channel_is_not_called_live() -> None:
     old = Beat(5, None, 1.0)
     assert (old.standing(6), old.silent_s(6), old.delay_s) == ("stale", None, None)
+
+
+def test_a_pulse_that_is_brought_up_is_that_of_all_samples_at_once(make_client, clock: list[float]) -> None:
+    """Whatever came in between, in whatever order: a flood of old samples after a few new ones, and late ones."""
+    client = make(make_client)
+    begin = clock[0] - 10_000.0
+    send(client, [begin + k for k in range(600)], T_px=[290.0] * 600, T_tank=[15.0] * 600, Q_px=[0.5] * 600)
+    assert channels(client)["T_px"]["last_time"] is not None
+    send(client, [begin + 9_000.0 + k for k in range(20)], T_px=[291.0] * 20, Q_px=[0.5] * 20)
+    for first in (1_000.0, 2_000.0, 3_000.0):
+        send(client, [begin + first + k for k in range(700)], T_px=[290.0] * 700, Q_px=[0.5] * 700)
+    send(client, [begin + 8_000.0 + k for k in range(5)], T_tank=[15.0] * 5)
+    found = channels(client)
+    client.close()
+    again = make_client(workbench=FakeWorkbench)  # it looks through everything
+    assert channels(again) == found

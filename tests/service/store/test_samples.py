@@ -140,3 +140,21 @@ def test_residuals_one_by_one_are_gathered_and_outlined(connection: Connection) 
     np.testing.assert_array_equal(kept.time_us, [*range(0, 5_101_000, 1000), *range(5_600_000, 5_700_000, 1000)])
     residuals.forget(connection, 1, 1, 2, 5_100_000, 2**62)
     assert residuals.select(connection, 1, 1, 2).time_us.size == 5101
+
+
+def test_what_came_since_is_read_newest_first_and_only_as_far_as_wanted(connection: Connection) -> None:
+    """A million samples may have come since the last look, of which the newest dozen are wanted."""
+    for k in range(5):
+        time_us = 1000 * k + np.arange(600)
+        appending.append(connection, 1, Batch(time_us, np.stack([time_us * 1.0, time_us * 1.0])))
+    asked: list[int] = []
+
+    def is_wanted(last_us: int) -> bool:
+        asked.append(last_us)
+        return len(asked) < 3
+
+    found = samples.newest_first(connection, 1, 2, 600, is_wanted)
+    assert [batch.time_us[0] for batch in found] == [4000, 3000]
+    assert asked == [4599, 3599, 2599]
+    everything = samples.newest_first(connection, 1, 2, 600, lambda _: True)
+    assert [batch.time_us[0] for batch in everything] == [4000, 3000, 2000, 1000]
