@@ -34,6 +34,15 @@ class Past:
         return values_at(self.time_s, self.column, time_s, held=self.held)
 
     @cached_property
+    def _summed(self) -> FloatArray:
+        """The integral up to each sample, value times s, of a channel that holds."""
+        return np.concatenate([[0.0], np.cumsum(self.column[:-1] * np.diff(self.time_s))])
+
+    def integral(self, time_s: FloatArray) -> FloatArray:
+        """Return the integral of a channel that holds from the first sample up to any times, value times s."""
+        return np.interp(time_s, self.time_s, self._summed)
+
+    @cached_property
     def period(self) -> Period | None:
         """Its own period, None where it has none."""
         return find_period(self.time_s, self.column, held=self.held)
@@ -61,6 +70,15 @@ class Rule:
         # a moment that the period's own error puts just beyond the origin belongs to the cycle before
         cycles = np.ceil((lead_s - APART_S) / self.period_s)
         return self.past.at(origin_s + lead_s - np.maximum(cycles, 0.0) * self.period_s)
+
+    def integral_ahead(self, origin_s: FloatArray, lead_s: FloatArray) -> FloatArray:
+        """Return the integral of ``ahead`` over the lead time, value times s, of a channel that holds; both broadcast."""
+        if self.period_s is None:
+            return self.ahead(origin_s, lead_s) * lead_s
+        before = np.maximum(np.ceil(lead_s / self.period_s), 1.0) - 1.0
+        cycle = self.past.integral(origin_s) - self.past.integral(origin_s - self.period_s)
+        rest = self.past.integral(origin_s + lead_s - (before + 1.0) * self.period_s)
+        return before * cycle + rest - self.past.integral(origin_s - self.period_s)
 
 
 @dataclass(frozen=True)
@@ -168,7 +186,7 @@ def future_record(
     times = own
     if plan is not None:
         times = np.union1d(times, plan.time_s[(plan.time_s > times[0]) & (plan.time_s < times[-1])])
-    times = _with_times(times, [_repeats(rule, now_s, float(own[-1])) for rule in rules.values()])
+    times = _with_times(times, [_repeats(rule, now_s, float(own[-1]), step_s) for rule in rules.values()])
     values: dict[str, FloatArray] = {}
     for name in driving(spec):
         column = record.values.get(name)
@@ -192,11 +210,19 @@ def own_times_s(record: Record, horizon_s: float, step_s: float) -> FloatArray:
     return record.time_s[-1] + step_s * np.arange(count + 1, dtype=np.float64)
 
 
-def _repeats(rule: Rule, now_s: float, stop_s: float) -> FloatArray:
-    """Return when samples of the last period come again."""
+def _repeats(rule: Rule, now_s: float, stop_s: float, step_s: float) -> FloatArray:
+    """Return when samples of the last period come again.
+
+    Of a channel that holds, those that change nothing are left out where the forecast's own steps are as short as its
+    sampling: they would only double the work.
+    """
     if rule.period_s is None:
         return np.empty(0)
-    last = rule.past.time_s[rule.past.time_s > now_s - rule.period_s]
+    time_s, column = rule.past.time_s, rule.past.column
+    tells = time_s > now_s - rule.period_s
+    if rule.past.held and tells.sum() > 1 and step_s <= np.median(np.diff(time_s[tells])) + APART_S:
+        tells &= np.diff(column, prepend=np.nan) != 0.0
+    last = time_s[tells]
     cycles = np.arange(1, int(np.ceil((stop_s - now_s) / rule.period_s)) + 1)
     again = (last + rule.period_s * cycles[:, None]).ravel()
     return again[(again > now_s) & (again < stop_s)]

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.forecast.assumed import Rule
+from twin_core.forecast.assumed import APART_S, Rule
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.simulate.forcing import Forcing
@@ -110,18 +110,23 @@ def _alike(rules: Mapping[str, Rule], origins: FloatArray, now_s: float) -> IntA
 
 
 def _errors(rule: Rule, origins: FloatArray, lead_s: FloatArray, known_s: float) -> FloatArray:
-    """Return what a channel did less what its rule says, (n_origins, n_steps, 2); a held channel holds over a step.
+    """Return what a channel did less what its rule says, (n_origins, n_steps, 2); of one that holds the mean over a step.
 
     Beyond what the past tells, a repeated channel misses at each phase what it did before, a held one what it did last.
     """
-    if rule.past.held:
-        lead_s = np.repeat(lead_s.mean(axis=1, keepdims=True), 2, axis=1)
     if rule.period_s is not None and rule.period_s <= known_s:
-        whole = np.ceil(np.maximum(lead_s - known_s, 0.0) / rule.period_s)
+        whole = np.ceil(np.maximum(lead_s[:, 1:] - known_s, 0.0) / rule.period_s)
         lead_s = lead_s - whole * rule.period_s
     lead_s = np.minimum(lead_s, known_s)
     at = origins[:, None, None]
-    return rule.past.at(at + lead_s) - rule.ahead(at, lead_s)
+    if not rule.past.held:
+        return rule.past.at(at + lead_s) - rule.ahead(at, lead_s)
+    missed_s = rule.past.integral(at + lead_s) - rule.integral_ahead(at, lead_s)
+    length_s = np.diff(lead_s)
+    late = np.flatnonzero(length_s <= APART_S)
+    mean = np.diff(missed_s, axis=2) / np.where(length_s > APART_S, length_s, 1.0)
+    mean[:, late] = rule.past.at(at + lead_s[late, 1:]) - rule.ahead(at, lead_s[late, 1:])
+    return np.repeat(mean, 2, axis=2)
 
 
 def deviations_K(

@@ -9,7 +9,7 @@ from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
 from twin_core.forecast import forecast
-from twin_core.forecast.assumed import assume
+from twin_core.forecast.assumed import Past, Rule, assume
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -72,6 +72,37 @@ def test_held_bands_contain_what_the_input_did_before() -> None:
         naive.append(np.abs(read - held_K) <= 1.645 * NOISE_K)
     assert 0.82 <= np.mean(inside) <= 0.97, np.mean(inside)
     assert np.mean(naive) < 0.6
+
+
+def test_what_a_held_input_missed_is_the_same_heat_whatever_the_steps() -> None:
+    """Edges that lie within a step count with their share of it: an integrator tells heats apart to the J."""
+    rng = np.random.default_rng(5)
+    time_s = STEP_S * np.arange(900.0)
+    power = np.repeat(rng.choice([0.0, 30.0], 300), rng.poisson(9, 300) + 1)[:900]
+    past = record_of(time_s, T0=290.0, Q=power)
+    found = ahead(integrator(Q=POWER), past, 2.0 * PERIOD_S, inputs="hold")
+    fine = forecast_in_steps(past, 7.5)
+    assert fine.time_s[7] == found.time_s[0]
+    np.testing.assert_allclose(found.mean_K, fine.mean_K[7::8], atol=1e-6)
+    for q, quantile_K in found.quantiles_K.items():  # of a mixture: between members far apart it is hardly determined
+        assert np.median(np.abs(quantile_K - fine.quantiles_K[q][7::8])) < 1e-6
+
+
+def forecast_in_steps(past: Record, step_s: float) -> Any:
+    state = {"time_s": past.time_s[-1], "nodes": ["n0"], "mean_K": [290.0], "covariance_K2": [[0.0]]}
+    last = past.take(np.array([past.time_s.size - 1]))
+    options = {"step_s": step_s, "past": past, "state": state, "inputs": "hold"}
+    return forecast(integrator(Q=POWER), last, 2.0 * PERIOD_S, **options)
+
+
+@pytest.mark.parametrize("period_s", [None, 700.0])
+def test_the_integral_of_what_is_assumed_is_that_of_its_values(period_s: float | None) -> None:
+    """Riemann sums of a second, over several periods."""
+    time_s = 10.0 * np.arange(200.0)
+    rule = Rule(Past(time_s, np.random.default_rng(0).normal(size=200), True), period_s)
+    origin_s, lead_s = np.array([[1203.0], [1990.0]]), np.arange(1.0, 2500.0, 1.0)
+    sums = np.cumsum(rule.ahead(origin_s, lead_s - 0.5), axis=1)
+    np.testing.assert_allclose(rule.integral_ahead(origin_s, lead_s), sums, atol=1e-6)
 
 
 def test_without_a_past_an_input_holds_and_nothing_is_said() -> None:
