@@ -10,7 +10,7 @@ from twin_core._typing import Float32Array, FloatArray
 
 CLOSE = 1e-10
 """Share of a standard deviation by which a quantile may be missed."""
-NEAR = 1e-4
+NEAR = 1e-3
 """A step of Halley's method shorter than this leaves an error of its third power, about."""
 SURE = 8.3
 """Standard deviations beyond which a normal distribution is 0 or 1 to rounding."""
@@ -89,9 +89,8 @@ def _quantiles(
         before, ahead = z, z
         for k in range(std.shape[1]):
             own, size = means[i, k], std[i, k]
-            centre, low, high = own.mean(), own.min() + z * size, own.max() + z * size
-            x = min(max(centre + ahead * size, low), high)
-            moved = high - low
+            centre, low, high, moved = own.sum() / n_members, -np.inf, np.inf, np.inf
+            x = centre + ahead * size
             for _ in range(MOST_HALVINGS):
                 total, slope, bend = _mixture(x, own, 1.0 / size, below, density)
                 excess = total / n_members - probability
@@ -103,7 +102,9 @@ def _quantiles(
                 if slope > 0.0:
                     newton = -excess * n_members / slope
                     step = size * newton / max(1.0 + 0.5 * newton * bend / slope, 0.5)
-                if not (low <= x + step <= high) or abs(step) > 0.5 * abs(moved):
+                if not (np.isfinite(step) and low <= x + step <= high and abs(step) <= 0.5 * abs(moved)):
+                    # no member's own quantile lies beyond all of them
+                    low, high = max(low, own.min() + z * size), min(high, own.max() + z * size)
                     step, close = 0.5 * (low + high) - x, CLOSE
                 x += step
                 if abs(step) <= close * size:

@@ -216,8 +216,10 @@ class Split:
         parts = couplings(self.network, self.values, along, driven=True)
         if parts.others or parts.relays or self.network.capacities:
             return None
-        mine = parts.linear_W_per_K @ self.about_K + parts.fourth_W_per_K4 @ self.about_K**4
-        return np.asarray((parts.heat_W - mine) / self.own_J_per_K).reshape(forcing.n_steps, 2, -1)
+        rates = parts.heat_W
+        rates -= parts.linear_W_per_K @ self.about_K + parts.fourth_W_per_K4 @ self.about_K**4
+        rates /= self.own_J_per_K
+        return rates.reshape(forcing.n_steps, 2, -1)
 
     @cached_property
     def own_J_per_K(self) -> FloatArray:
