@@ -3,7 +3,6 @@
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -21,8 +20,8 @@ from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
 from twin_core.effects.base import Effect
-from twin_core.errors import TelemetryError
-from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
+from twin_core.errors import ModelError, TelemetryError
+from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import bear_witness, told_by
 from twin_core.network.screened import screened
@@ -130,9 +129,10 @@ def close_loop(
             progress=lambda f, m: progress(0.35 + 0.5 * f, m),
         )
         found.every = every
-        after = _corrected_or(before, whole, found) if found.findings else before
         progress(0.88, "predicting the hold-out")
-        predictions = ([predict(before, h) for h in held], [predict(after, h) for h in held])
+        declared = [predict(before, h) for h in held]
+        after, predicted = _corrected(whole, found, held) or (before, declared)
+        predictions = (declared, predicted)
         report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
         progress(0.93, "drawing")
         witness = bear_witness(found, deadline=latest)
@@ -149,13 +149,26 @@ def close_loop(
         return ClosedLoop(report, after, before, plots)
 
 
-def _corrected_or(before: CalibratedModel, whole: Trial, found: Search) -> CalibratedModel:
-    """Return the corrected model; where its arithmetic fails the findings are given up, told, and the declared one stays."""
-    after = attempted(partial(corrected, whole, found), "the corrected model", found.failures)
+def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[CalibratedModel, list[Prediction]] | None:
+    """Return the corrected model and its predictions, None without findings.
+
+    Where either cannot be computed the findings are given up, told, and the declared model stays.
+    """
+
+    def done() -> tuple[CalibratedModel, list[Prediction]]:
+        model = corrected(whole, found)
+        return model, [predict(model, h) for h in held]
+
+    if not found.findings:
+        return None
+    try:
+        after = attempted(done, "the corrected model", found.failures)
+    except ModelError as error:
+        found.failures.append(f"the corrected model: {error}")
+        after = None
     if after is None:
         found.rejected += [replace(f.judged, reason=NO_MODEL) for f in found.findings]
         found.findings, found.trial = [], found.base
-        return before
     return after
 
 

@@ -9,7 +9,7 @@ from twin_core._typing import FloatArray
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.errors import TelemetryError
+from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.simulate.extrapolation import extrapolations, in_words
 from twin_core.simulate.forcing import build_forcing
@@ -123,12 +123,22 @@ class Prediction:
 
 
 def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
-    """Roll a model out over a hold-out stretch from the state filtered at the end of its lead."""
+    """Roll a model out over a hold-out stretch from the state filtered at the end of its lead.
+
+    Raises
+    ------
+    ModelError
+        If the balance has no solution there: an error over the rest alone would look better than the model is.
+    """
     network = model.network()
     values = network.parameters.values
     state = assimilate(model, held.lead).mean_K
     forcing = build_forcing(network, held.scored, model.max_step_s)
     path = rollout(network, values, state, forcing)
+    if not path.converged:
+        raise ModelError(
+            f"{held.scored.name}: the heat balance has no solution over the hold-out; check its inputs and boundaries"
+        )
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
     read += reading_offsets_K(network, values, held.scored.clock_s)
     measured = measured_temperatures(model.spec, held.scored)

@@ -10,10 +10,12 @@ import pytest
 
 from benchmarks.case import Case
 from benchmarks.network_cases import network_case
+from twin_core import closed_loop
+from twin_core.calibrate.result import CalibratedModel
 from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.effects import REGISTRY
-from twin_core.errors import Cancelled, TelemetryError
-from twin_core.holdout import predict, split_burn_in
+from twin_core.errors import Cancelled, ModelError, TelemetryError
+from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -93,6 +95,20 @@ def test_the_corrected_model_carries_the_effect(run: Run) -> None:
     assert len(places) == len(run.report["findings"])
     assert run.loop.before_model.effects == ()
     assert run.loop.model.network().parameters.free_names == run.loop.model.free_names
+
+
+def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(model: CalibratedModel, held: HeldOut) -> Prediction:
+        if model.effects:
+            raise ModelError("the heat balance has no solution over the hold-out")
+        return predict(model, held)
+
+    monkeypatch.setattr(closed_loop, "predict", fails)
+    case = small_case("leak_to_boundary", CASES["leak_to_boundary"])
+    report = close_loop(case.spec, [case.record]).report
+    assert report["findings"] == [] and report["verdict"] != "effect_added"
+    assert report["after"] == report["before"]
+    assert any("no solution over the hold-out" in reason for reason in report["failures"])
 
 
 def check_score(score: dict[str, Any], sensors: tuple[str, ...]) -> None:

@@ -6,7 +6,7 @@ import pytest
 from tests.analytic import linear_states
 from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.errors import TelemetryError
+from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, predict, split_burn_in, split_fraction
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
@@ -133,6 +133,16 @@ def test_the_prediction_is_never_corrected() -> None:
     wild[1:] = np.random.default_rng(5).uniform(0.0, 1000.0, wild.size - 1)
     spoilt = HeldOut(held.lead, Record(held.scored.time_s, {**held.scored.values, "T0": wild}))
     np.testing.assert_array_equal(predict(wall_model(), spoilt).predicted_K, predict(wall_model(), held).predicted_K)
+
+
+def test_a_prediction_without_a_solution_is_refused_not_scored_in_part() -> None:
+    record, _ = wall_record(200)
+    _, (held,) = split_fraction([record], 0.4)
+    drained = held.scored.values["Q"].copy()
+    drained[40:] = -1e9  # no temperature above absolute zero balances it
+    impossible = HeldOut(held.lead, Record(held.scored.time_s, {**held.scored.values, "Q": drained}))
+    with pytest.raises(ModelError, match="no solution over the hold-out"):
+        predict(wall_model(), impossible)
 
 
 def test_the_start_sample_and_excluded_intervals_are_not_scored() -> None:

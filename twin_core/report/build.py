@@ -1,6 +1,7 @@
 """The decision in a form for machines and people: report.json and what its page plots."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -65,13 +66,18 @@ def evidence_json(judged: Judged) -> Json:
     return row
 
 
-def findings_json(findings: Sequence[Finding], model: CalibratedModel) -> list[Json]:
-    """Return the findings in the order of their evidence; effects judged together stand next to each other."""
+def findings_json(findings: Sequence[Finding], model: CalibratedModel, failures: list[str]) -> list[Json]:
+    """Return the findings in the order of their evidence; effects judged together stand next to each other.
+
+    Where no experiment can be told for want of finite numbers, the reason is added to ``failures``.
+    """
     stds = {p["name"]: p["std"] for p in model.summary["parameters"]}
     fitted = {effect.place: effect for effect in model.effects}
     rows = []
     for finding in sorted(findings, key=lambda f: -f.judged.evidence.log_bayes_factor):
-        experiments = [experiment.row() for experiment in separating(finding)]
+        what = f"experiments for {finding.judged.labels}"
+        told = attempted(partial(separating, finding), what, failures) or []
+        experiments = [experiment.row() for experiment in told]
         together = {effect.place for effect in finding.effects}
         for effect in finding.effects:
             own = fitted[effect.place]
@@ -221,7 +227,7 @@ def build_report(
         "train": span_json(train, before.summary["train"]["samples"]),
         "holdout": span_json([h.scored for h in held], counted),
         "before": scores[0],
-        "findings": findings_json(search.findings, after),
+        "findings": findings_json(search.findings, after, failures),
         "after": scores[1],
         "noise_floor_K": noise_floor_K(before),
         **_of_holdout((before, after), scores, predictions),

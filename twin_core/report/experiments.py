@@ -290,7 +290,14 @@ def information_bits(
     -------
     float
         In bits, between zero and the entropy of the weights.
+
+    Raises
+    ------
+    ArithmeticError
+        If what is predicted is not finite.
     """
+    if not all(np.isfinite(part).all() for option in predicted for part in option):
+        raise ArithmeticError("what an experiment would show is not finite")
     mean = predicted[0][0]
     every = np.column_stack([*(m - mean for m, _ in predicted[1:]), *(f for _, f in predicted)])
     # Outside what these columns span, readings are the same noise under every option; R holds the columns in a basis of it.
@@ -301,7 +308,8 @@ def information_bits(
     for k, (_, factor) in enumerate(predicted):
         own = turned[:, first : first + factor.shape[1]]
         first += factor.shape[1]
-        root = np.asarray(np.linalg.cholesky(np.eye(n_basis) + own @ own.T), dtype=np.float64)
+        # A factor of 1 + F Fᵀ that never forms it: what the record hardly determines would drown the noise in rounding.
+        root = np.asarray(np.linalg.qr(np.vstack([np.eye(n_basis), own.T]), mode="r"), dtype=np.float64).T
         options.append((np.zeros(n_basis) if k == 0 else turned[:, k - 1], root))
     total = 0.0
     with np.errstate(divide="ignore"):
@@ -317,4 +325,4 @@ def information_bits(
 def _log_density(drawn: FloatArray, centre: FloatArray, root: FloatArray) -> FloatArray:
     """Return the log density of normal readings (r, n_draws) but for a constant, (n_draws,)."""
     scaled = np.linalg.solve(root, drawn - centre[:, None])
-    return np.asarray(-0.5 * (scaled**2).sum(axis=0) - np.log(np.diag(root)).sum())
+    return np.asarray(-0.5 * (scaled**2).sum(axis=0) - np.log(np.abs(np.diag(root))).sum())

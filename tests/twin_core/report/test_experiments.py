@@ -127,6 +127,21 @@ def test_a_difference_that_parameters_can_take_up_tells_nothing() -> None:
     assert taken_up < 0.02
 
 
+def test_what_the_record_hardly_determines_tells_nothing_and_drowns_nothing() -> None:
+    """A direction known to 1e10 noises, common to both options, is only lost: the rest tells what it tells without it."""
+    apart, vague = np.zeros(50), np.zeros((50, 2))
+    apart[3], vague[7, 0], vague[9] = 2.0, 1e10, (3e9, 1e9)
+    told = information_bits([(np.zeros(50), vague), (apart, vague)], np.array([0.5, 0.5]), n_draws=20_000)
+    expected = gain_by_quadrature([0.0, 2.0], [1.0, 1.0], [0.5, 0.5])
+    assert told == pytest.approx(expected, abs=0.02)
+
+
+def test_an_experiment_without_finite_numbers_is_a_numerical_failure() -> None:
+    wrong = np.full((5, 1), np.nan)
+    with pytest.raises(ArithmeticError, match="not finite"):
+        information_bits([(np.zeros(5), wrong), (np.ones(5), wrong)], np.array([0.5, 0.5]))
+
+
 def test_the_best_experiment_gains_most_and_no_more_than_there_is(finding: Finding) -> None:
     found = separating(finding)
     gains = [experiment.gain_bits for experiment in found]

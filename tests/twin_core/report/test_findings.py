@@ -27,6 +27,6 @@ def test_what_an_alternative_has_as_well_is_not_in_doubt(monkeypatch: pytest.Mon
     names = [p.name for e in (leak, heat) for p in e.parameters()]
     summary = {"parameters": [{"name": name, "std": 0.1} for name in names]}
     model: Any = SimpleNamespace(effects=(leak, heat), summary=summary)
-    told = {row["effect"]: row["alternatives"] for row in build.findings_json([Finding(pair, (option,))], model)}
+    told = {row["effect"]: row["alternatives"] for row in build.findings_json([Finding(pair, (option,))], model, [])}
     assert told["leak_to_boundary"] == []
     assert told["constant_heat_load"] == [{"effect": "sensor_lag", "where": {"sensor": "T_b"}, "log_bayes_factor": 8.0}]
