@@ -66,6 +66,11 @@ class Nominal:
         """A and B averaged over each kind of step: the same whatever the size of the undeclared heat."""
         return self.grid.means_of(self.steps)
 
+    @cached_property
+    def is_finite(self) -> bool:
+        """Whether the linearisation has not run away."""
+        return bool(np.isfinite(self.reference_K).all() and np.isfinite(self.steps.transition).all())
+
     @property
     def residual_K(self) -> FloatArray:
         """Measured minus what the linearised model reads without undeclared heat, (n_samples, n_sensors)."""
@@ -177,7 +182,7 @@ def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Seque
     """Return the log-likelihood of the readings of all segments; minus infinity where the linearisation ran away."""
     total = 0.0
     for nominal in nominals:
-        if not (np.isfinite(nominal.reference_K).all() and np.isfinite(nominal.steps.transition).all()):
+        if not nominal.is_finite:
             return -np.inf
         whitened, log_det = whiten(problem, undeclared, nominal, nominal.residual_K[:, :, None])
         count = int(nominal.segment.valid.sum())
