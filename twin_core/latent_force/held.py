@@ -49,6 +49,10 @@ class Grid:
         gathered = np.add.reduceat(matrices[np.argsort(self.kind, kind="stable")], begins, axis=0)
         return np.asarray(gathered / counts[:, None, None])
 
+    def means_of(self, steps: Steps) -> tuple[FloatArray, FloatArray]:
+        """Return the means of A and of B."""
+        return self.means(steps.transition), self.means(steps.heat_response_K_per_W)
+
 
 def grid_of(step_s: FloatArray, sample_of: IntArray, valid: BoolArray) -> Grid:
     """Return how steps repeat: (n_steps,) lengths, (n_steps + 1,) samples on them, (n_samples, n_sensors) readings."""
@@ -116,7 +120,12 @@ class HeldForce:
         return np.exp(-self.step_s / self.length_s)
 
     def whiten(
-        self, columns: FloatArray, sample_of: IntArray, valid: BoolArray, grid: Grid | None = None
+        self,
+        columns: FloatArray,
+        sample_of: IntArray,
+        valid: BoolArray,
+        grid: Grid | None = None,
+        means: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[FloatArray, float]:
         """Return columns of readings in the metric of the model, and ln det of the readings' covariance.
 
@@ -132,9 +141,11 @@ class HeldForce:
         valid : (n_samples, n_sensors)
         grid
             How the steps repeat, where it is known already.
+        means
+            Of A and of B over each kind of step, where they are known already.
         """
         grid = grid or grid_of(self.step_s, sample_of, valid)
-        transition, response = grid.means(self.steps.transition), grid.means(self.steps.heat_response_K_per_W)
+        transition, response = means or grid.means_of(self.steps)
         parts, log_det = [], 0.0
         for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
             whitened, log_det = whiten_columns(

@@ -1,9 +1,10 @@
 """The derivatives of ``derivatives`` for networks of many nodes: the same formulas, carried out by BLAS and LAPACK.
 
-The compiled loops are the quicker ones below some dozens of nodes; beyond, products and factors of full matrices decide. What
-a step adds to the columns of parameters is gathered in the modes of A and brought to the nodes with the rest of the step. To the
-columns of initial temperatures nothing is added: as the quick modes die out they span less and less, and what is carried on is
-a basis of what is left.
+The compiled loops are the quicker ones below some dozens of nodes; beyond, products of full matrices decide, and few are
+needed in the modes of A, where a step of the linear part is one number per mode. What is left of the Jacobian beside A couples
+few nodes as a rule: it takes products as narrow as these, and the implicit end of a step a matrix of their number (Woodbury). To
+the columns of initial temperatures nothing is added: as the quick modes die out they span less and less, and what is carried on
+is a basis of what is left.
 """
 
 import numpy as np
@@ -22,45 +23,25 @@ SPARSE = 0.2
 quicker. Measured side by side on one core with 100 to 658 nodes and 30 or 100 columns: one by one takes 0.3 to 1.6 times as long
 at a share of 0.1, 1.4 to 3 times at 0.3, 6 times at 1; with 6 columns full matrices are always the quicker way."""
 
-FILLED = 0.04
-"""Beyond this share of entries a change of A is quicker as a full matrix than entry by entry. Measured side by side on one core
-with 100 to 658 nodes: entry by entry takes 0.4 to 0.8 of the time at 2 %, 1.2 to 1.9 times as long at 5 %, 2 to 4 at 10 %."""
-
-
 FADED = 1e-12
 """What is smaller than this, beside the largest derivative by an initial temperature at the start, is no longer carried on."""
 
 
 @njit(cache=True, nogil=True)
-def _add_entries(row: IntArray, column: IntArray, entry: FloatArray, weight: FloatArray, out: FloatArray) -> None:
-    """Add weight @ (the matrix with these entries) to ``out``, both transposed."""
-    for e in range(row.size):
+def _drive(
+    column: IntArray,
+    node: IntArray,
+    first: FloatArray,
+    last: FloatArray,
+    inward: FloatArray,
+    early: FloatArray,
+    late: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add what rates of the nodes (n_entries,) at both ends of a step do to the modes of each column, (n_columns, n)."""
+    for e in range(column.size):
         for i in range(out.shape[1]):
-            out[column[e], i] += weight[row[e], i] * entry[e]
-
-
-@njit(cache=True, nogil=True)
-def _times_entries(row: IntArray, column: IntArray, entry: FloatArray, state: FloatArray, out: FloatArray) -> None:
-    """Add (the matrix with these entries) @ state to ``out``."""
-    for e in range(row.size):
-        for i in range(out.shape[1]):
-            out[row[e], i] += entry[e] * state[column[e], i]
-
-
-def _filled(row: IntArray, column: IntArray, entry: FloatArray, n: int) -> FloatArray:
-    """Return the matrix with these entries, (n, n)."""
-    filled = np.bincount(row * n + column, weights=entry, minlength=n * n).reshape(n, n)
-    return filled.astype(np.float64, copy=False)
-
-
-def _changed(row: IntArray, column: IntArray, entry: FloatArray, state: FloatArray) -> FloatArray:
-    """Return (the matrix with these entries) @ state, the quicker way."""
-    n = state.shape[0]
-    if row.size > FILLED * n * n:
-        return _filled(row, column, entry, n) @ state
-    out = np.zeros_like(state)
-    _times_entries(row, column, entry, state, out)
-    return out
+            out[column[e], i] += (first[e] * early[i] + last[e] * late[i]) * inward[node[e], i]
 
 
 def _spanned(columns: FloatArray, least: float) -> tuple[FloatArray, FloatArray]:
@@ -72,15 +53,6 @@ def _spanned(columns: FloatArray, least: float) -> tuple[FloatArray, FloatArray]
     shares = np.empty((rank, order.size))
     shares[:, order] = triangle[:rank]
     return basis[:, :rank], shares
-
-
-def _add_changed(row: IntArray, column: IntArray, entry: FloatArray, weight: FloatArray, out: FloatArray) -> None:
-    """Add weight @ (the matrix with these entries) to ``out``, both transposed, the quicker way."""
-    n = out.shape[0]
-    if row.size > FILLED * n * n:
-        out += _filled(column, row, entry, n) @ weight
-    else:
-        _add_entries(row, column, entry, weight, out)
 
 
 @njit(cache=True, nogil=True)
@@ -131,6 +103,41 @@ class _Turned:
             _turn(self._columns, turns.row, turns.column, turns.value_W_per_K, inward, through, out)
 
 
+class _Beside:
+    """What the Jacobian has beside A, in modes: the nodes that it couples, and entries that differ from step to step."""
+
+    def __init__(self, modes: Modes, row: IntArray, column: IntArray) -> None:
+        rows, row_at = np.unique(row, return_inverse=True)
+        columns, column_at = np.unique(column, return_inverse=True)
+        self._shape, self._at = (rows.size, columns.size), row_at * columns.size + column_at
+        self._into = np.ascontiguousarray(modes.inward[:, rows])
+        self._outof = np.ascontiguousarray(modes.outward[columns])
+
+    def _matrix(self, entry: FloatArray) -> FloatArray:
+        size = self._shape[0] * self._shape[1]
+        return np.bincount(self._at, weights=entry, minlength=size).astype(np.float64, copy=False).reshape(self._shape)
+
+    def coupled(self, state: FloatArray) -> FloatArray:
+        """Return the temperatures of the nodes that it reads, (n_columns_read, n_columns), of states in modes."""
+        return np.asarray(self._outof @ state)
+
+    def times(self, entry: FloatArray, coupled: FloatArray) -> FloatArray:
+        """Return its product with states whose ``coupled`` are known, in modes, (n, n_columns)."""
+        return np.asarray(self._into @ (self._matrix(entry) @ coupled))
+
+    def through(self, late: FloatArray) -> FloatArray:
+        """Return what rates of the nodes that it drives do to those that it reads, by weights of the modes."""
+        return np.asarray(self._outof @ (late[:, None] * self._into))
+
+    def solved(
+        self, entry: FloatArray, late: FloatArray, through: FloatArray, right: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return x with x = right + late * (this @ x), by Woodbury's formula, and what of it is coupled."""
+        matrix = self._matrix(entry)
+        coupled = np.linalg.solve(np.eye(self._shape[1]) - through @ matrix, self._outof @ right)
+        return np.asarray(right + late[:, None] * (self._into @ (matrix @ coupled))), np.asarray(coupled)
+
+
 def march_sensitivities_of_many(
     step_s: FloatArray,
     modes: Modes,
@@ -161,36 +168,37 @@ def march_sensitivities_of_many(
     moved = 1 + max(
         int(turns.columns.max(initial=-1)), int(entry_column.max(initial=-1))
     )  # columns of parameters come first
-    state: FloatArray = start
+    state: FloatArray = modes.inward @ start
     shares = np.eye(n_columns - moved)
     turned = _Turned(modes, turns)
-    inward, outward = (np.ascontiguousarray(matrix.T) for matrix in (modes.inward, modes.outward))
+    inward, reading = np.ascontiguousarray(modes.inward.T), np.ascontiguousarray(modes.outward[observed])
     at_s, keep, whole, late = np.nan, np.empty(n), np.empty(n), np.empty(n)
-    divided, mixed, identity = np.empty((3, n, n)), np.empty((n, n)), np.eye(n)
-    at = entry_column * n + entry_node
+    divided, mixed = np.empty((3, n, n)), np.empty((n, n))
+    beside = _Beside(modes, row, column)
+    coupled, through = beside.coupled(state), np.empty((0, 0))
+    series = np.ascontiguousarray(entry_series.transpose(1, 2, 0))
     least = FADED * float(np.abs(start[:, moved:]).max(initial=0.0))
     for k in range(n_steps):
         if step_s[k] != at_s:
             at_s = float(step_s[k])
             weights(at_s, modes.rate_per_s, keep, whole, late)
-            early = whole - late
-            turned_keep, turned_early, turned_late = ((inward * weight) @ outward for weight in (keep, early, late))
+            early, through = whole - late, beside.through(late)
             if turns.columns.size > 0:
                 divided_differences(at_s, modes.rate_per_s, keep, early, late, divided)
-        backward = identity.copy()
-        _add_changed(row, column, -entry[k, 1], turned_late, backward)
-        first, last = (np.bincount(at, weights=entry_series[:, k, end], minlength=moved * n) for end in (0, 1))
-        given = first.reshape(moved, n) @ inward * early + last.reshape(moved, n) @ inward * late
+        given = np.zeros((moved, n))
+        _drive(entry_column, entry_node, series[k, 0], series[k, 1], inward, early, late, given)
         if turns.columns.size > 0:
             _mix(divided, early, late, mode[k], pushed[k], mixed)
             turned.add(mixed, inward, given)
-        forward = turned_keep.T @ state + turned_early.T @ _changed(row, column, entry[k, 0], state)
-        forward[:, :moved] += (given @ outward).T
-        state = np.asarray(np.linalg.solve(backward.T, forward), dtype=np.float64)
+        forward = keep[:, None] * state + early[:, None] * beside.times(entry[k, 0], coupled)
+        forward[:, :moved] += given.T
+        state, coupled = beside.solved(entry[k, 1], late, through, forward)
         if (k + 1).bit_count() == 1:  # at steps 1, 2, 4, ...: so often does it pay
-            fading, left = _spanned(state[:, moved:], least)
-            state, shares = np.hstack([state[:, :moved], fading]), left @ shares
+            fading, left = _spanned(modes.outward @ state[:, moved:], least)
+            state, shares = np.hstack([state[:, :moved], modes.inward @ fading]), left @ shares
+            coupled = beside.coupled(state)
         if k + 1 in samples:
-            read = state[observed]
+            read = reading @ state
             out[samples[k + 1]] = np.hstack([read[:, :moved], read[:, moved:] @ shares])
-    return out, np.hstack([state[:, :moved], state[:, moved:] @ shares])
+    end = modes.outward @ state
+    return out, np.hstack([end[:, :moved], end[:, moved:] @ shares])

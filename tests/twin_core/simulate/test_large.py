@@ -33,7 +33,7 @@ def test_both_ways_agree(with_start: bool, sparse: float, most: int) -> None:
     small = found()
     with (
         patch.object(response_module, "MANY", 1),
-        patch.multiple(large_module, SPARSE=sparse, FILLED=sparse),
+        patch.object(large_module, "SPARSE", sparse),
         patch.multiple(response_module, MOST_VALUES=most, LEAST_STEPS=7),
     ):
         large = found()

@@ -8,6 +8,7 @@ its presence, ``size`` tells how large it is.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -59,6 +60,11 @@ class Nominal:
     offset_K: FloatArray
     sample_of: IntArray
     grid: Grid
+
+    @cached_property
+    def means(self) -> tuple[FloatArray, FloatArray]:
+        """A and B averaged over each kind of step: the same whatever the size of the undeclared heat."""
+        return self.grid.means_of(self.steps)
 
     @property
     def residual_K(self) -> FloatArray:
@@ -164,7 +170,7 @@ def whiten(
 ) -> tuple[FloatArray, float]:
     """Return columns (n_samples, n_sensors, n_columns) in the metric of the readings, and ln det of their covariance."""
     force = held_force(problem, undeclared, nominal)
-    return force.whiten(columns, nominal.sample_of, nominal.segment.valid, nominal.grid)
+    return force.whiten(columns, nominal.sample_of, nominal.segment.valid, nominal.grid, nominal.means)
 
 
 def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]) -> float:
