@@ -4,7 +4,7 @@ import asyncio
 import ctypes
 import logging
 import multiprocessing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
@@ -70,9 +70,9 @@ class Engine:
         """Return the open-loop error of a model."""
         return await self._ask(_score, self._workbench, document, telemetry)
 
-    async def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+    async def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
         """Return which samples are no readings."""
-        return await self._ask(_screen, self._workbench, dict(units), telemetry)
+        return await self._ask(_screen, self._workbench, dict(units), tuple(inputs), telemetry)
 
     async def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""
@@ -144,8 +144,10 @@ def _score(workbench: MakeWorkbench, document: str, telemetry: Telemetry) -> flo
     return workbench().score(document, telemetry)
 
 
-def _screen(workbench: MakeWorkbench, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
-    return workbench().screen(units, telemetry)
+def _screen(
+    workbench: MakeWorkbench, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry
+) -> Masks:
+    return workbench().screen(units, inputs, telemetry)
 
 
 def _forecast(workbench: MakeWorkbench, document: str, task: ForecastTask) -> Forecasted:

@@ -11,8 +11,7 @@ from service.live.engine import Engine
 from service.store.samples import Samples
 from service.twins.registry import Entry
 from service.workbench.interface import Masks, Telemetry
-from twin_core.quality.runs import runs_of
-from twin_core.quality.screen import SENTINEL
+from twin_core.quality.screen import SENTINEL, spans_of
 
 CONTEXT = 256
 """So many samples before a block tell what its channels usually do."""
@@ -25,7 +24,8 @@ async def masks_of(twin: Entry, engine: Engine, found: Samples) -> Masks:
     if not found.time_us.size:
         return {}
     values = {name: found.values[row] for row, name in enumerate(twin.channels)}
-    return await engine.screen(twin.units, Telemetry(int(found.time_us[0]), found.time_us, values))
+    inputs = [name for name in twin.channels if name not in twin.sensors]
+    return await engine.screen(twin.units, inputs, Telemetry(int(found.time_us[0]), found.time_us, values))
 
 
 async def readings(twin: Entry, engine: Engine, context: Samples | None, fresh: Samples) -> tuple[Samples, Samples]:
@@ -61,11 +61,12 @@ def told(found: Samples, masks: Masks, names: Sequence[str], since_us: int) -> d
         if name not in names:
             continue
         for reason, mask in reasons.items():
-            for first, stop in zip(*(ends.tolist() for ends in runs_of(mask)), strict=True):
+            for first, stop in spans_of(reason, mask):
                 if found.time_us[stop - 1] < since_us:
                     continue
                 start, last = (format_instant(int(found.time_us[at])) for at in (first, stop - 1))
-                spans[name].append({"start": start, "stop": last, "reason": reason, "samples": stop - first})
+                samples = int(mask[first:stop].sum())
+                spans[name].append({"start": start, "stop": last, "reason": reason, "samples": samples})
     return {name: sorted(rows, key=lambda row: str(row["start"])) for name, rows in spans.items()}
 
 

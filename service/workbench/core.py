@@ -1,7 +1,7 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -146,13 +146,13 @@ class CoreWorkbench:
         parts = cut_at_gaps([record], model.spec.driving_channels)
         return _rmse_K(model, [split_burn_in(part, None) for part in parts if part.time_s.size >= LEAST_PART])
 
-    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+    def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
         """Look for samples that are no readings."""
         from twin_core.quality import screen
         from twin_core.units import to_si
 
         columns = {name: to_si(column, units[name]) for name, column in telemetry.values.items()}
-        return screen((telemetry.time_us - telemetry.epoch_us) / 1e6, columns, units).masks
+        return screen((telemetry.time_us - telemetry.epoch_us) / 1e6, columns, units, inputs).masks
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""

@@ -1,7 +1,7 @@
 """The science behind one small door: what the service asks for, in plain arrays and JSON that travel between processes."""
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -200,8 +200,8 @@ class Workbench(Protocol):
     def score(self, document: str, telemetry: Telemetry) -> float | None:
         """Return the open-loop error of a model in K over some telemetry, which begins with a burn-in; None if it has none."""
 
-    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
-        """Return which samples of channels in these units are no readings."""
+    def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
+        """Return which samples of channels in these units, some of which are inputs, are no readings."""
 
     def forecast(self, document: str, task: ForecastTask) -> Forecasted:
         """Look ahead."""

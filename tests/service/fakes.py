@@ -3,7 +3,7 @@
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -115,7 +115,7 @@ class FakeWorkbench:
         """Score a model by what its document says of it."""
         return float(json.loads(document)["rmse_K"])
 
-    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+    def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
         """Take everything for a reading."""
         return {}
 

@@ -1,7 +1,7 @@
 """Samples that are no readings: stored as they came, masked for the filter, told with the residuals."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 import pytest
@@ -18,9 +18,9 @@ TWIN = "/v1/twins/benchsat"
 class ScreeningWorkbench(FakeWorkbench):
     """Filters like the fake one, yet looks at the readings as the real one does."""
 
-    def screen(self, units: Mapping[str, str | None], telemetry: Telemetry) -> Masks:
+    def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
         """Look for samples that are no readings."""
-        return CoreWorkbench().screen(units, telemetry)
+        return CoreWorkbench().screen(units, inputs, telemetry)
 
 
 @pytest.fixture

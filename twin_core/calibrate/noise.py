@@ -1,11 +1,13 @@
 """What the noise of a sensor is, told from its own samples."""
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from twin_core._typing import FloatArray
 from twin_core.network.spec import TwinSpec
-from twin_core.quality.quantisation import quantum
+from twin_core.quality.quantisation import quantum, resolution
 from twin_core.telemetry import Record
 
 FALLBACK_STD_K = 0.1
@@ -50,21 +52,41 @@ def _divided_differences(time_s: FloatArray, column: FloatArray) -> FloatArray:
     return np.asarray(scaled / np.linalg.norm(weights, axis=1))
 
 
+def _noise_of_changes_K(time_s: FloatArray, column: FloatArray) -> float:
+    """Return the white-noise standard deviation told by the present readings that differ from the one before; NaN if too few."""
+    seen = np.isfinite(column)
+    time_s, column = time_s[seen], column[seen]
+    changed = np.diff(column, prepend=np.nan) != 0.0
+    return difference_noise_K(time_s[changed], column[changed])
+
+
 def sensor_noise_K(spec: TwinSpec, records: list[Record]) -> FloatArray:
     """Return the noise standard deviation of each sensor, (n_sensors,), in K.
 
     The declared one where there is one, with the variance of quantisation (step^2 / 12) added; else estimated from
-    differences, never below what quantisation leaves: a quantised sensor that does not move is not noise-free.
+    differences, never below what quantisation leaves: a quantised sensor that does not move is not noise-free. Where readings
+    are missing between all others, or most repeat the one before, those that change tell; of a sensor that hardly moves its
+    smallest change stands for the step.
     """
     stds = []
     for sensor in spec.sensors:
         columns = [(r.time_s, r.values[sensor]) for r in records if sensor in r.values]
-        step_K = max((quantum(c) for _, c in columns), default=0.0)
+        counting = max((quantum(c) for _, c in columns), default=0.0) / np.sqrt(12.0)
         declared = spec.noise_std_K(sensor)
-        estimates = [e for e in (difference_noise_K(t, c) for t, c in columns) if np.isfinite(e)]
-        estimate = float(np.median(estimates)) if estimates else FALLBACK_STD_K
-        counting = step_K / np.sqrt(12.0)
-        # What the readings show contains their quantisation wherever they move; a datasheet's figure does not.
-        std = max(estimate, counting) if declared is None else float(np.hypot(declared, counting))
+        if declared is not None:  # what the readings show contains their quantisation wherever they move, this does not
+            std = float(np.hypot(declared, counting))
+        else:
+            std = (
+                max(_median(difference_noise_K(t, c) for t, c in columns), counting)
+                or _median(_noise_of_changes_K(t, c) for t, c in columns)
+                or min((step for _, c in columns if (step := resolution(c)) > 0.0), default=0.0) / np.sqrt(12.0)
+                or FALLBACK_STD_K
+            )
         stds.append(max(std, 1e-4))
     return np.array(stds)
+
+
+def _median(estimates: Iterable[float]) -> float:
+    """Return the median of the estimates that are numbers, zero without any."""
+    told = [e for e in estimates if np.isfinite(e)]
+    return float(np.median(told)) if told else 0.0

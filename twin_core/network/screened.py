@@ -33,5 +33,6 @@ def screened(spec: TwinSpec, record: Record) -> Record:
     if record.flaws is not None:
         return record
     units = {name: channel.unit for name, channel in spec.channels.items()}
-    clean = masked(record, units, dict.fromkeys(spec.sensors, excluded(record, spec.exclude)))
+    ignored = dict.fromkeys(spec.sensors, excluded(record, spec.exclude))
+    clean = masked(record, units, ignored, spec.driving_channels)
     return replace(clean, notices=tuple(dict.fromkeys([*clean.notices, *doubts(spec, clean)])))

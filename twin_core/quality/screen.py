@@ -1,18 +1,19 @@
 """What of a record is no reading: every detector in its order, and the record without it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.quality.frozen import frozen_channel, frozen_rows
+from twin_core.quality.held import held_repeats
 from twin_core.quality.runs import runs_of
 from twin_core.quality.sentinels import sentinels
 from twin_core.quality.spikes import spikes
 from twin_core.telemetry import Flaw, Record
 
-FROZEN, RAIL, SENTINEL, SPIKE = "frozen", "rail", "sentinel", "spike"
+FROZEN, HELD, RAIL, SENTINEL, SPIKE = "frozen", "held", "rail", "sentinel", "spike"
 TEMPERATURE_UNITS = ("K", "degC")
 
 
@@ -41,7 +42,12 @@ class Screening:
         return next((reason for reason, mask in self.masks.get(channel, {}).items() if mask[row]), None)
 
 
-def screen(time_s: FloatArray, columns: Mapping[str, FloatArray], units: Mapping[str, str | None]) -> Screening:
+def screen(
+    time_s: FloatArray,
+    columns: Mapping[str, FloatArray],
+    units: Mapping[str, str | None],
+    inputs: Collection[str] = (),
+) -> Screening:
     """Look for samples that cannot be readings.
 
     Parameters
@@ -53,6 +59,8 @@ def screen(time_s: FloatArray, columns: Mapping[str, FloatArray], units: Mapping
     units : channel -> unit
         The unit in which each channel was written; K and degC tell the temperatures. A command may hold for ever and
         switch at once: only temperatures spike and freeze on their own.
+    inputs
+        Channels that no node is read by: what they hold, they may well be meant to.
 
     Returns
     -------
@@ -68,6 +76,9 @@ def screen(time_s: FloatArray, columns: Mapping[str, FloatArray], units: Mapping
 
     for channel, column in columns.items():
         take(channel, SENTINEL, sentinels(time_s, column, units.get(channel)))
+    for channel in columns:
+        if units.get(channel) in TEMPERATURE_UNITS and channel not in inputs:
+            take(channel, HELD, held_repeats(time_s, left[channel]))
     rows = frozen_rows(list(left.values()))
     for channel in columns:
         take(channel, FROZEN, rows & np.isfinite(left[channel]))
@@ -92,7 +103,12 @@ def _at_an_extreme(column: FloatArray, frozen: BoolArray) -> BoolArray:
     return railed
 
 
-def masked(record: Record, units: Mapping[str, str | None], ignored: Mapping[str, BoolArray] | None = None) -> Record:
+def masked(
+    record: Record,
+    units: Mapping[str, str | None],
+    ignored: Mapping[str, BoolArray] | None = None,
+    inputs: Collection[str] = (),
+) -> Record:
     """Return a record without samples that cannot be readings: they are missing, and its notices say so.
 
     A record that was looked at before is returned as it is.
@@ -102,13 +118,14 @@ def masked(record: Record, units: Mapping[str, str | None], ignored: Mapping[str
     record
         In SI.
     units : channel -> unit
+    inputs
         As :func:`screen` takes them.
     ignored : channel -> (n_times,)
         Samples that take no part in anything: they are left as they are.
     """
     if record.flaws is not None:
         return record
-    screening = screen(record.time_s, record.values, units)
+    screening = screen(record.time_s, record.values, units, inputs)
     if ignored is not None:
         screening = screening.without(ignored)
     values = dict(record.values)
@@ -123,11 +140,18 @@ def unmasked(record: Record) -> Record:
     return replace(record, flaws=())
 
 
+def spans_of(reason: str, mask: BoolArray) -> list[tuple[int, int]]:
+    """Return first sample and sample after the last of the spans of a mask; what is held is one, however many repeats it has."""
+    first, stop = (ends.tolist() for ends in runs_of(mask))
+    return [(first[0], stop[-1])] if reason == HELD and first else list(zip(first, stop, strict=True))
+
+
 def _flaws(record: Record, screening: Screening) -> Iterator[Flaw]:
     for channel, reasons in screening.masks.items():
         for reason, mask in reasons.items():
-            for first, stop in zip(*(ends.tolist() for ends in runs_of(mask)), strict=True):
-                yield Flaw(channel, reason, float(record.time_s[first]), float(record.time_s[stop - 1]), stop - first)
+            for first, stop in spans_of(reason, mask):
+                samples = int(mask[first:stop].sum())
+                yield Flaw(channel, reason, float(record.time_s[first]), float(record.time_s[stop - 1]), samples)
 
 
 def _notices(record: Record, screening: Screening) -> Iterator[str]:
@@ -147,6 +171,7 @@ def _notices(record: Record, screening: Screening) -> Iterator[str]:
 
 _WORDS = {
     FROZEN: "frozen (repeated for longer than quantisation explains)",
+    HELD: "repeats until a slower sensor reported again",
     RAIL: "stuck at a rail (the end of the range)",
     SENTINEL: "markers of missing samples",
     SPIKE: "spikes (off what the readings on both sides allow)",

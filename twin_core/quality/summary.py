@@ -6,7 +6,7 @@ from html import escape
 from twin_core._typing import Json
 from twin_core.telemetry import Record
 
-COLOURS = {"frozen": "#4f7cac", "rail": "#8e6c8a", "sentinel": "#c0504d", "spike": "#e0a030"}
+COLOURS = {"frozen": "#4f7cac", "held": "#9aa5b1", "rail": "#8e6c8a", "sentinel": "#c0504d", "spike": "#e0a030"}
 """Of each reason, in the strip."""
 
 MOST_SPANS = 20

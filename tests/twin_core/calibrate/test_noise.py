@@ -82,3 +82,25 @@ def test_quantisation_adds_its_variance_to_a_declared_noise() -> None:
 def test_a_sensor_that_tells_nothing_gets_a_usual_noise() -> None:
     found = sensor_noise_K(SPEC, [record_of(np.arange(4.0), A=290.0, B=290.0)])
     np.testing.assert_array_equal(found, [FALLBACK_STD_K, 0.05, 0.01])
+
+
+def readings(column: np.ndarray) -> float:
+    """Return the noise of a sensor for which none is declared."""
+    filler = np.full(column.size, 280.0)
+    return float(sensor_noise_K(SPEC, [record_of(60.0 * np.arange(column.size), A=column, B=filler, C=filler)])[0])
+
+
+@pytest.mark.parametrize("period", [2, 3, 5])
+def test_repeats_between_the_samples_of_a_slow_sensor_are_no_quiet_readings(period: int) -> None:
+    own = 290.0 + 3.0 * np.sin(np.arange(2000) / 300.0) + noise(0.1, n=2000)
+    held = np.repeat(own, period)
+    alone = np.where(np.arange(held.size) % period == 0, held, np.nan)
+    assert readings(alone) == pytest.approx(0.1, rel=0.1)
+    if period > 3:  # of fewer repeats second differences see some, and the screening leaves none
+        assert readings(held) == pytest.approx(0.1, rel=0.1)
+
+
+def test_a_sensor_that_hardly_moves_shows_its_resolution_at_most() -> None:
+    """A whole kelvin from code to code, crossed three times: readings are good to 1 / sqrt 12 of it, not to nothing."""
+    assert readings(np.repeat([333.0, 334.0, 335.0, 336.0], 12)) == pytest.approx(1.0 / np.sqrt(12.0))
+    assert readings(np.full(50, 290.0)) == FALLBACK_STD_K
