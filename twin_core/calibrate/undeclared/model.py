@@ -197,17 +197,25 @@ def gain_of_undeclared_heat(fit: HeatFit) -> float:
     return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
 
 
-def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:
+def parameter_columns(
+    problem: Problem, values: FloatArray, nominal: Nominal, *, with_residual: bool = False
+) -> FloatArray:
     """Return the linear response of the readings to the free parameters, (n_samples, n_sensors, n_free).
 
-    The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`).
+    The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`). The
+    residual may follow as one more column.
     """
     network, forcing = problem.network, nominal.segment.forcing
     path = Rollout(nominal.steps.stages_K, nominal.starts_K[0], True)
     still = np.zeros((problem.n_nodes, problem.n_free))
-    parts = sensitivities(network, values, forcing, path, still, network.sensor_node)
-    block = np.concatenate([part for _, part in parts])
-    return problem.with_reading_derivatives(values, nominal.segment, block)
+    shape = (forcing.sample_step.size, network.sensor_node.size)
+    columns = np.empty((*shape, problem.n_free + with_residual))
+    for samples, part in sensitivities(network, values, forcing, path, still, network.sensor_node):
+        columns[samples, :, : problem.n_free] = part
+    problem.with_reading_derivatives(values, nominal.segment, columns[:, :, : problem.n_free])
+    if with_residual:
+        columns[:, :, -1] = nominal.residual_K
+    return columns
 
 
 def smoothed_states(
