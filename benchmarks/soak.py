@@ -39,8 +39,9 @@ PERIOD_S, NOISE_K = 300, 0.05
 FRESH_S = 15.0
 """A forecast is of the present if its state is at most so much older than the newest frame acknowledged when it was asked for."""
 LANES = 4
-WARM_UP_S = 120.0
-"""A process counts as warm so long after its start; what it needs then is compared with what it needs at the end."""
+WARM_UP_S = 540.0
+"""A process counts as warm so long after its start; what it needs then is compared with what it needs at the end. Each twin's
+stream keeps ``hub.IN_MEMORY`` messages, two for each frame: at one frame a second they are there after 500 s."""
 GROWTH = 1.1
 Row = list[str]
 
