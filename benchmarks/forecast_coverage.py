@@ -6,25 +6,34 @@ model then carries); then forecasts of three orbits start at moments that neithe
 simultaneous band all of one orbit's (of one horizon's) with 90 %. ``python -m benchmarks.forecast_coverage [--spacecraft N]
 [--effects none random] [--starts N] [--sets ROOT]`` writes ``benchmarks/tables/forecast_coverage.md``; without
 spacecraft (``--spacecraft 0``) the flight sets have a table of their own, ``forecast_coverage_flight.md``.
+
+A flight set is one record, all of whose forecasts share the errors of its parameters: what share it ought to cover is told by
+``--worlds N``, records of which the set's own model, misfit and noise are the truth, each calibrated and forecast anew.
 """
 
 import argparse
 import os
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import accumulate
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.markdown import markdown_table, save_table
+from twin_core.assimilate import assimilate
 from twin_core.calibrate import CalibratedModel, calibrate
 from twin_core.closed_loop import close_loop
 from twin_core.fem.demo import ORBIT_S, demo_scenario
 from twin_core.fem.scenario import load_scenario
 from twin_core.fem.simulate import simulate
 from twin_core.forecast import forecast
+from twin_core.network.dynamics import reading_offsets_K
 from twin_core.network.screened import screened
 from twin_core.network.spec_io import load_spec
+from twin_core.simulate.forcing import build_forcing
+from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 from twin_core.telemetry_csv import read_csv
 
@@ -39,6 +48,8 @@ FLIGHT_SETS = {
     "three_block_tue": ("three-block.yaml", "three_block_24h.csv"),
 }
 TRAIN_SHARE, HORIZON_SHARE, FLIGHT_STARTS = 0.6, 0.05, 12
+START_SAMPLES = 20
+"""Readings that tell where a simulated record starts."""
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 Row = list[str]
 
@@ -97,6 +108,51 @@ def flight(name: str, root: Path) -> tuple[CalibratedModel, Record, list[float],
     return calibrate(spec, [record.take(record.time_s <= first_s)]), record, cuts.tolist(), horizon_s
 
 
+def worlds(model: CalibratedModel, record: Record, count: int) -> Iterator[Record]:
+    """Yield records with the inputs of one, whose readings are the model's rollout with its misfit and its noise."""
+    network = model.network()
+    values = network.parameters.values
+    forcing = build_forcing(network, record, model.max_step_s)
+    start_K = assimilate(model, record.take(np.arange(START_SAMPLES))).mean_K
+    path = rollout(network, values, start_K, forcing)
+    assert path.converged
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
+    read += reading_offsets_K(network, values, record.clock_s)
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        made = dict(record.values)
+        for column, sensor in enumerate(model.spec.sensors):
+            size_K = model.misfit_K[sensor]
+            keep = np.exp(-np.diff(record.time_s, prepend=-np.inf) / model.misfit_length_s[sensor])
+            shocks = size_K * np.sqrt(1.0 - keep**2) * rng.standard_normal(record.time_s.size)
+            misfit = np.array(list(accumulate(zip(keep, shocks, strict=True), _next, initial=0.0))[1:])
+            noise = model.noise_K[sensor] * rng.standard_normal(record.time_s.size)
+            made[sensor] = np.where(np.isnan(record.values[sensor]), np.nan, read[:, column] + misfit + noise)
+        yield replace(record, values=made)
+
+
+def _next(now: float, step: tuple[float, float]) -> float:
+    """Return an Ornstein-Uhlenbeck process after a step that keeps so much of it and adds so much."""
+    return step[0] * now + step[1]
+
+
+def world_rows(label: Row, model: CalibratedModel, record: Record, starts: list[float], count: int) -> Iterator[Row]:
+    """Yield a line per mode: the mean over worlds, and how far one world lies from it."""
+    horizon_s, step_s = HORIZON_SHARE * float(np.ptp(record.time_s)), float(np.median(np.diff(record.time_s)))
+    found: dict[str, list[tuple[float, float]]] = {mode: [] for mode in MODES}
+    for world in worlds(model, record, count):
+        own = calibrate(model.spec, [world.take(world.time_s <= starts[0])])
+        for mode in MODES:
+            inside, whole = coverage(own, world, starts, horizon_s, step_s, 1, mode)
+            found[mode].append((float(inside.mean()), float(whole.mean())))
+            print(" | ".join([*label, mode, f"{inside.mean():.1%}"]), flush=True)
+    for mode, shares in found.items():
+        inside, whole = np.array(shares).T
+        spread = f"one world lies {inside.std(ddof=1):.1%} from their mean"
+        error = inside.std(ddof=1) / np.sqrt(count)
+        yield [*label, mode, f"{inside.mean():.1%} ± {error:.1%}", spread, f"{whole.mean():.0%}"]
+
+
 def rows_of(
     label: Row, count: Callable[[str], tuple[np.ndarray, np.ndarray]]
 ) -> Iterator[tuple[Row, np.ndarray, float]]:
@@ -122,6 +178,7 @@ def main() -> None:
     parser.add_argument("--spacecraft", type=int, default=4, help="how many spacecraft of each kind, from seed 0")
     parser.add_argument("--effects", nargs="*", default=["none", "random"], choices=["none", "random"])
     parser.add_argument("--starts", type=int, default=8, help="forecasts of each")
+    parser.add_argument("--worlds", type=int, default=0, help="simulated records of each flight set")
     parser.add_argument("--sets", type=Path, default=os.environ.get("MEASURED_DATA"), help="folder of measured sets")
     arguments = parser.parse_args()
     rows: list[Row] = []
@@ -154,6 +211,8 @@ def main() -> None:
         label = [name, "", f"horizon {horizon_s / 3600:.3g} h"]
         count = partial(coverage, model, record, starts, horizon_s, step_s, 1)
         rows += [row for row, _, _ in rows_of(label, count)]
+        if arguments.worlds > 1:
+            rows += world_rows([name, f"{arguments.worlds} worlds", label[2]], model, record, starts, arguments.worlds)
     header = [
         "record",
         "hidden",
@@ -167,7 +226,8 @@ def main() -> None:
         "The readings are those of the sensors, noise included. plan: inputs as they came; auto: no plan, periodic inputs "
         "repeat and the others hold; hold: no plan, all hold. whole orbit inside: share of sensors and starts whose every "
         "reading of the first orbit (of the horizon, on flight sets) lies in the simultaneous 90 % band. ±: standard error, from "
-        "how the starts of a record differ, or the spacecraft."
+        "how the starts of a record differ, or the spacecraft, or worlds: records simulated from the set's own model, misfit and "
+        "noise, each calibrated anew. All forecasts of one record share the errors of its parameters, which ± does not know."
     )
     table = markdown_table(header, rows)
     name, of = ("forecast_coverage", "") if arguments.spacecraft else ("forecast_coverage_flight", " on flight sets")

@@ -10,7 +10,7 @@ from twin_core.assimilate import assimilate
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
 from twin_core.forecast.assumed import How, Inputs, assume, future_record, own_times_s
-from twin_core.forecast.bands import mixture_quantile, whole_path_factor
+from twin_core.forecast.bands import mixture_quantiles, whole_path_factor
 from twin_core.forecast.past import Missed, deviations_K, missed
 from twin_core.forecast.spread import spread
 from twin_core.network.dynamics import reading_offsets_K
@@ -126,7 +126,7 @@ def forecast(
     if found is not None:
         moved = deviations_K(network, values, forcing, path, assumed.rules, found, wanted)
     std, here = np.sqrt(about.variance_K2), read[wanted]
-    bands = {q: mixture_quantile(q, std, moved) for q in {*quantiles, *_BAND}}
+    bands = mixture_quantiles({*quantiles, *_BAND}, std, moved)
     kept = about.kept
     low, middle, high = (bands[q] for q in _BAND)
     factor = whole_path_factor(

@@ -1,5 +1,6 @@
 """Quantiles of a mixture of Gaussians, and the band in which a whole path stays."""
 
+from collections.abc import Collection
 from functools import lru_cache
 
 import numpy as np
@@ -25,26 +26,36 @@ KEPT_ROWS = 1024
 """So many instants' drawn numbers are kept, 2 MB: drawing them again gives the same."""
 
 
-def mixture_quantile(probability: float, std: FloatArray, deviations: FloatArray) -> FloatArray:
-    """Return the quantile of an equal mixture of normal distributions, by Halley's method within a bracket.
+def mixture_quantiles(
+    probabilities: Collection[float], std: FloatArray, deviations: FloatArray
+) -> dict[float, FloatArray]:
+    """Return quantiles of an equal mixture of normal distributions, by Halley's method within a bracket.
 
     Parameters
     ----------
-    probability
+    probabilities
         Between 0 and 1.
     std : (n_times, ...)
         Common standard deviation, positive.
     deviations : (n_members, n_times, ...)
         Means of the members; none: one member at zero.
+
+    Returns
+    -------
+    dict
+        Probability -> (n_times, ...).
     """
-    z = float(ndtri(probability))
     if deviations.shape[0] == 0:
-        return np.asarray(z * std)
+        return {p: np.asarray(ndtri(p) * std) for p in probabilities}
     n_times = std.shape[0]
     means = np.ascontiguousarray(deviations.reshape(deviations.shape[0], n_times, -1).T)
-    out = np.empty((means.shape[0], n_times))
-    _quantiles(probability, z, np.ascontiguousarray(std.reshape(n_times, -1).T), means, _BELOW, _DENSITY, out)
-    return out.T.reshape(std.shape)
+    centre, size = means.mean(axis=2), np.ascontiguousarray(std.reshape(n_times, -1).T)
+    made = {}
+    for p in probabilities:
+        out = np.empty(centre.shape)
+        _quantiles(p, float(ndtri(p)), size, means, centre, _BELOW, _DENSITY, out)
+        made[p] = out.T.reshape(std.shape)
+    return made
 
 
 @njit(cache=True, nogil=True)
@@ -76,21 +87,22 @@ def _quantiles(
     z: float,
     std: FloatArray,
     means: FloatArray,
+    centre: FloatArray,
     below: FloatArray,
     density: FloatArray,
     out: FloatArray,
 ) -> None:
     """Write the quantiles of mixtures of means (n, n_times, n_members) and std (n, n_times) to ``out``, (n, n_times).
 
-    Each search begins where the two quantiles before point to. ``z`` is the normal quantile.
+    Each search begins where the two quantiles before point to. ``z`` is the normal quantile, ``centre`` the mean of the means.
     """
     n_members = means.shape[2]
     for i in range(std.shape[0]):
         before, ahead = z, z
         for k in range(std.shape[1]):
             own, size = means[i, k], std[i, k]
-            centre, low, high, moved = own.sum() / n_members, -np.inf, np.inf, np.inf
-            x = centre + ahead * size
+            low, high, moved = -np.inf, np.inf, np.inf
+            x = centre[i, k] + ahead * size
             for _ in range(MOST_HALVINGS):
                 total, slope, bend = _mixture(x, own, 1.0 / size, below, density)
                 excess = total / n_members - probability
@@ -111,7 +123,7 @@ def _quantiles(
                     break
                 moved = step
             out[i, k] = x
-            here = (x - centre) / size
+            here = (x - centre[i, k]) / size
             before, ahead = here, 2.0 * here - before if k > 0 else here
 
 

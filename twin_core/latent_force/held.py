@@ -148,6 +148,7 @@ class HeldForce:
         transition, response = means or grid.means_of(self.steps)
         parts, log_det = [], 0.0
         for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
+            some = columns[:, :, first : first + COLUMNS_AT_ONCE]
             whitened, log_det = whiten_columns(
                 transition,
                 response,
@@ -161,7 +162,7 @@ class HeldForce:
                 sample_of,
                 grid.interval,
                 valid,
-                np.ascontiguousarray(np.nan_to_num(columns[:, :, first : first + COLUMNS_AT_ONCE])),
+                np.ascontiguousarray(np.where(np.isnan(some), 0.0, some)),
             )
             parts.append(whitened)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2), log_det

@@ -5,14 +5,14 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
 
-from twin_core.forecast.bands import mixture_quantile, whole_path_factor
+from twin_core.forecast.bands import mixture_quantiles, whole_path_factor
 
 
 @pytest.mark.parametrize("probability", [0.05, 0.3, 0.5, 0.95, 0.999])
 def test_quantiles_of_a_mixture(probability: float) -> None:
     rng = np.random.default_rng(1)
     std, deviations = rng.uniform(0.1, 2.0, (3, 2)), rng.normal(0.0, 5.0, (12, 3, 2))
-    found = mixture_quantile(probability, std, deviations)
+    found = mixture_quantiles([probability], std, deviations)[probability]
     for at in np.ndindex(3, 2):
         below = lambda x, at=at: norm.cdf(x, deviations[:, *at], std[at]).mean() - probability  # noqa: E731
         assert found[at] == pytest.approx(brentq(below, -50.0, 50.0, xtol=1e-12), abs=1e-8)
@@ -24,13 +24,13 @@ def test_quantiles_of_members_far_apart_and_of_equal_ones() -> None:
     deviations[:, 200:] = 7.0
     std = np.geomspace(1e-6, 1e3, 400)[:, None]
     for probability in (0.05, 0.5, 0.51, 0.95):
-        found = mixture_quantile(probability, std, deviations)
+        found = mixture_quantiles([probability], std, deviations)[probability]
         np.testing.assert_allclose(norm.cdf((found - deviations) / std).mean(axis=0), probability, atol=1e-9)
 
 
 def test_without_members_it_is_the_normal_quantile() -> None:
     std = np.array([[0.5], [2.0]])
-    np.testing.assert_allclose(mixture_quantile(0.95, std, np.zeros((0, 2, 1))), norm.ppf(0.95) * std)
+    np.testing.assert_allclose(mixture_quantiles([0.95], std, np.zeros((0, 2, 1)))[0.95], norm.ppf(0.95) * std)
 
 
 @pytest.mark.parametrize(("n_kept", "n_between"), [(1, 1.0), (30, 1.0), (10, 3.0), (200, 1.0)])

@@ -92,7 +92,7 @@ def gauss_newton_step(
     hessian = np.diag(1.0 / std**2)
     gradient = (free - parameters.free) / std**2
     for nominal in nominals:
-        columns = np.concatenate([parameter_columns(problem, values, nominal), nominal.residual_K[:, :, None]], axis=2)
+        columns = parameter_columns(problem, values, nominal, with_residual=True)
         whitened, _ = whiten(problem, undeclared, nominal, columns)
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]

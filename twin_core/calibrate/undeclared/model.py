@@ -66,6 +66,11 @@ class Nominal:
         """A and B averaged over each kind of step: the same whatever the size of the undeclared heat."""
         return self.grid.means_of(self.steps)
 
+    @cached_property
+    def is_finite(self) -> bool:
+        """Whether the linearisation has not run away."""
+        return bool(np.isfinite(self.reference_K).all() and np.isfinite(self.steps.transition).all())
+
     @property
     def residual_K(self) -> FloatArray:
         """Measured minus what the linearised model reads without undeclared heat, (n_samples, n_sensors)."""
@@ -177,7 +182,7 @@ def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Seque
     """Return the log-likelihood of the readings of all segments; minus infinity where the linearisation ran away."""
     total = 0.0
     for nominal in nominals:
-        if not (np.isfinite(nominal.reference_K).all() and np.isfinite(nominal.steps.transition).all()):
+        if not nominal.is_finite:
             return -np.inf
         whitened, log_det = whiten(problem, undeclared, nominal, nominal.residual_K[:, :, None])
         count = int(nominal.segment.valid.sum())
@@ -192,17 +197,25 @@ def gain_of_undeclared_heat(fit: HeatFit) -> float:
     return fit.log_likelihood - log_likelihood(fit.problem, none, fit.nominals)
 
 
-def parameter_columns(problem: Problem, values: FloatArray, nominal: Nominal) -> FloatArray:
+def parameter_columns(
+    problem: Problem, values: FloatArray, nominal: Nominal, *, with_residual: bool = False
+) -> FloatArray:
     """Return the linear response of the readings to the free parameters, (n_samples, n_sensors, n_free).
 
-    The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`).
+    The undeclared heat counts as a rate of temperature: it moves with the capacities (see :func:`with_capacities`). The
+    residual may follow as one more column.
     """
     network, forcing = problem.network, nominal.segment.forcing
     path = Rollout(nominal.steps.stages_K, nominal.starts_K[0], True)
     still = np.zeros((problem.n_nodes, problem.n_free))
-    parts = sensitivities(network, values, forcing, path, still, network.sensor_node)
-    block = np.concatenate([part for _, part in parts])
-    return problem.with_reading_derivatives(values, nominal.segment, block)
+    shape = (forcing.sample_step.size, network.sensor_node.size)
+    columns = np.empty((*shape, problem.n_free + with_residual))
+    for samples, part in sensitivities(network, values, forcing, path, still, network.sensor_node):
+        columns[samples, :, : problem.n_free] = part
+    problem.with_reading_derivatives(values, nominal.segment, columns[:, :, : problem.n_free])
+    if with_residual:
+        columns[:, :, -1] = nominal.residual_K
+    return columns
 
 
 def smoothed_states(
