@@ -14,14 +14,14 @@ FINE = 3.0
 """Typical change over the smallest distance between two readings, above which repeats are held: from code to code of a
 converter it is one or two."""
 
-SMALLEST, LONGEST = 0.02, 0.95
-"""Quantiles that stand for the smallest distance, and for how long a reading may be held."""
+SMALLEST = 0.02
+"""Quantile that stands for the smallest distance."""
 
 
 def held_repeats(column: FloatArray) -> BoolArray:
     """Return the repeats of readings that are held until the next one, (n_times,); of healthy channels none.
 
-    Of a reading that lasts longer than the others do one repeat in each such time stays: it may be frozen.
+    Of a reading that lasts longer than the longest of so many would one repeat in each such time stays: it may be frozen.
 
     Parameters
     ----------
@@ -41,5 +41,7 @@ def held_repeats(column: FloatArray) -> BoolArray:
         return found
     begins = np.concatenate([[0], changes])
     since = every - begins[np.searchsorted(changes, every, "right")]
-    found[at] = since % (int(np.quantile(lasting, LONGEST)) + 1) != 0
+    # Reports at random last exponentially long: the longest of n is log n times the mean, the median log 2 times.
+    longest = np.median(lasting) * np.log2(changes.size)
+    found[at] = since % int(np.ceil(longest)) != 0
     return found
