@@ -97,6 +97,21 @@ def test_the_corrected_model_carries_the_effect(run: Run) -> None:
     assert run.loop.model.network().parameters.free_names == run.loop.model.free_names
 
 
+@pytest.mark.parametrize("effect", [None, "leak_to_boundary"])
+def test_readings_that_rows_repeat_count_once(effect: str | None) -> None:
+    """A recorder that writes each reading for some rows makes no stairs that heat would have to explain."""
+    case = network_case(effect, 1, n_orbits=5, dt_s=60.0)
+    n_times = case.record.time_s.size
+    begins = np.flatnonzero(np.random.default_rng(3).random(n_times) < 0.3)
+    shown = np.maximum.accumulate(np.isin(np.arange(n_times), begins) * np.arange(n_times))
+    held = {name: case.record.values[name][shown] for name in case.spec.sensors}
+    record = Record(case.record.time_s, {**case.record.values, **held}, case.record.epoch_ns, "held")
+    report = close_loop(case.spec, [record]).report
+    assert {row["reason"] for row in report["quality"]} == {"held"}
+    assert [(f["effect"], f["where"]) for f in report["findings"]] == ([(effect, case.where)] if effect else [])
+    assert report["after"]["rmse_K"] < 1.5 * case.noise_K
+
+
 def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(model: CalibratedModel, held: HeldOut) -> Prediction:
         if model.effects:

@@ -129,15 +129,19 @@ def prune(state: Search, needed: float) -> None:
     """Drop findings, and members of a set that was found together, that the others have made superfluous.
 
     Beside the others each must be supported by the odds asked for, and explain at one sensor at least what the search would
-    look for.
+    look for. What is left of a set that lost a member is examined as any option: nobody has asked whether it holds alone.
     """
     for finding in list(state.findings):
+        rest = {effect.place for effect in finding.effects}
         for effect in finding.effects:
             if all(other.place == effect.place for other in state.trial.effects):
                 continue
             kept = _attempted_without(state, {effect.place})
             if kept is not None and (kept[1] <= needed or _explains_nothing(kept[0], state.trial)):
                 _drop(state, {effect.place}, *kept)
+                rest.discard(effect.place)
+        if rest and len(rest) < len(finding.effects):
+            _examine_again(state, rest, needed)
 
 
 def _explains_nothing(without: Trial, trial: Trial) -> bool:

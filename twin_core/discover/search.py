@@ -93,7 +93,7 @@ def search(
     looking = now + (1.0 - REVISION_SHARE) * (deadline - now)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
-        before = state.fork()
+        before, known = state.fork(), _places(state)
         with state.until(looking):
             extended = _extend(state, needed, fallback=False)
         refused, before.rejected = state.rejected[len(before.rejected) :], list(state.rejected)
@@ -103,6 +103,8 @@ def search(
             break
         complete(state, needed)
         prune(state, needed)
+        if _places(state) == known:
+            break  # what was found does not hold: the next step would find it again
     withdraw(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
@@ -113,6 +115,11 @@ def search(
     progress(0.95, "comparing what was found with other names")
     tell_alternatives(state, needed)
     return state
+
+
+def _places(state: Search) -> set[Place]:
+    """Return where the findings of a search act."""
+    return {effect.place for finding in state.findings for effect in finding.effects}
 
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:

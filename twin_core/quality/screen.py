@@ -78,7 +78,7 @@ def screen(
         take(channel, SENTINEL, sentinels(time_s, column, units.get(channel)))
     for channel in columns:
         if units.get(channel) in TEMPERATURE_UNITS and channel not in inputs:
-            take(channel, HELD, held_repeats(time_s, left[channel]))
+            take(channel, HELD, held_repeats(left[channel]))
     rows = frozen_rows(list(left.values()))
     for channel in columns:
         take(channel, FROZEN, rows & np.isfinite(left[channel]))

@@ -43,7 +43,7 @@ def test_healthy_telemetry_loses_nothing(seed: int, step_K: float, noise_K: floa
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(12, 200))
+@given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(16, 200))
 def test_frozen_rows_are_found_in_every_channel(seed: int, begin: int, lasting: int) -> None:
     columns = healthy(seed)
     for column in columns.values():
