@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -108,10 +109,10 @@ def with_own_states(effect: Effect, network: Network, along: Along) -> Along:
         moment = Along(np.array([t]), states[None], along.boundaries_K[:1], {}, np.ones(1))
         return added_heat_W(effect, network, moment, np.zeros_like(moment.temperatures_K))[0, n:] / capacity
 
-    span = (along.time_s[0], along.time_s[-1])
-    start = along.temperatures_K[0, own]
-    found = solve_ivp(rates, span, start, t_eval=along.time_s, rtol=1e-8, atol=1e-8, max_step=60.0)
-    return replace(along, temperatures_K=np.hstack([along.temperatures_K[:, :n], found.y.T]))
+    found = [along.temperatures_K[0, own]]
+    for span in pairwise(along.time_s.tolist()):  # no step over a kink of the straight lines between the points
+        found.append(solve_ivp(rates, span, found[-1], rtol=1e-10, atol=1e-10).y[:, -1])
+    return replace(along, temperatures_K=np.hstack([along.temperatures_K[:, :n], np.array(found)]))
 
 
 def declared_heat_W(effect: Effect, survey: Survey) -> np.ndarray:
