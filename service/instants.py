@@ -162,9 +162,28 @@ def format_instant(instant: int) -> str:
     return f"{(_EPOCH_UTC + timedelta(microseconds=instant)).isoformat()}Z"
 
 
+_behind_us = 0
+"""How far this machine's clock is behind the one that counts, see :func:`keep_to`."""
+
+
 def now_us() -> int:
     """Return the wall clock in microseconds since 1970."""
-    return time.time_ns() // 1000
+    return time.time_ns() // 1000 + _behind_us
+
+
+def keep_to(clock_us: int, asked_ns: int, answered_ns: int) -> None:
+    """Keep to another clock from now on: several processes must agree on what is late and what is ahead of time.
+
+    Parameters
+    ----------
+    clock_us
+        What it showed, between the two instants of ``time.time_ns`` at which it was asked and answered. A difference that
+        so long an answer may explain is left as it is.
+    """
+    global _behind_us
+    behind_us = clock_us - (asked_ns + answered_ns) // 2000
+    if abs(behind_us - _behind_us) > (answered_ns - asked_ns) // 1000:
+        _behind_us = behind_us
 
 
 _UNITS = (("d", 86_400.0), ("h", 3600.0), ("min", 60.0))

@@ -16,6 +16,7 @@ from typing import Any
 import psycopg
 
 from service.fleet.ownership import BEAT_S, LEASE_S, Leases
+from service.instants import keep_to
 from service.store import ownership
 from service.store.ownership import Changed
 from service.store.postgres.engine import Speaking, connect
@@ -104,9 +105,11 @@ class Bus:
                 ownership.give_back(connection, self.name)
 
     def _renew(self, driver: "psycopg.Connection[Any]", connection: Speaking) -> None:
-        asked_s = time.monotonic()
+        asked_s, asked_ns = time.monotonic(), time.time_ns()
         with driver.transaction():
             holding = ownership.renew(connection, self.name, round(1e6 * LEASE_S))
+        if holding.clock_us is not None:
+            keep_to(holding.clock_us, asked_ns, time.time_ns())
         self._leases.hold(holding, asked_s)
 
     def _pass_on(self, connection: Speaking) -> None:

@@ -11,19 +11,23 @@ from service.store.connection import Connection
 from service.store.errors import LeaseLost, TwinGone
 
 SLOTS = 256
+SPREAD = 159
+"""Odd, and near to SLOTS divided by the golden ratio: twins that are numbered one after the other spread evenly over any run of
+slots (multiplicative hashing, D. E. Knuth, The Art of Computer Programming 3, section 6.4)."""
 
 
 def slot_of(twin: int) -> int:
     """Return the slot of a twin."""
-    return twin % SLOTS
+    return twin * SPREAD % SLOTS
 
 
 @dataclass(frozen=True)
 class Holding:
-    """What a process owns: slot -> epoch. Others share the rest with it."""
+    """What a process owns: slot -> epoch. Others share the rest with it. ``clock_us`` is the database's, when it was asked."""
 
     epochs: dict[int, int]
     members: int
+    clock_us: int | None = None
 
 
 def renew(connection: Connection, name: str, lease_us: int) -> Holding:
@@ -42,7 +46,7 @@ def renew(connection: Connection, name: str, lease_us: int) -> Holding:
         (name,),
     )
     connection.execute("DELETE FROM member WHERE beat_us < clock_us() - ?", (lease_us,))
-    (members,) = connection.execute("SELECT count(*) FROM member").fetchone()
+    members, clock_us = connection.execute("SELECT count(*), clock_us() FROM member").fetchone()
     query = (
         "UPDATE slot SET until_us = clock_us() + ? WHERE owner = ? AND until_us > clock_us() RETURNING number, epoch"
     )
@@ -56,7 +60,7 @@ def renew(connection: Connection, name: str, lease_us: int) -> Holding:
         epochs = {slot: epoch for slot, epoch in epochs.items() if slot not in surplus}
     elif len(epochs) < share:
         epochs |= _take(connection, name, share - len(epochs), lease_us)
-    return Holding(epochs, members)
+    return Holding(epochs, members, clock_us)
 
 
 def _take(connection: Connection, name: str, most: int, lease_us: int) -> dict[int, int]:
@@ -73,9 +77,9 @@ def _take(connection: Connection, name: str, most: int, lease_us: int) -> dict[i
         rows = [(slot, epoch, name) for slot, epoch in taken.items()]
         connection.executemany("INSERT INTO tenure (slot, epoch, owner, from_us) VALUES (?, ?, ?, clock_us())", rows)
         connection.execute(
-            """UPDATE head SET epoch = slot.epoch FROM slot WHERE slot.number = mod(head.twin, ?) AND head.twin IN
-               (SELECT twin FROM head WHERE mod(twin, ?) = ANY(?) ORDER BY twin FOR UPDATE)""",
-            (SLOTS, SLOTS, sorted(taken)),
+            """UPDATE head SET epoch = slot.epoch FROM slot WHERE slot.number = mod(head.twin * ?, ?) AND head.twin IN
+               (SELECT twin FROM head WHERE mod(twin * ?, ?) = ANY(?) ORDER BY twin FOR UPDATE)""",
+            (SPREAD, SLOTS, SPREAD, SLOTS, sorted(taken)),
         )
     return taken
 

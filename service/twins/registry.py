@@ -94,8 +94,9 @@ class Registry:
             self.add(twin)
 
     def add(self, twin: Twin) -> Entry:
-        """Take in a twin and return its entry."""
-        return self._entries.setdefault(twin.name, _entry(twin))
+        """Take in a twin and return its entry; one of the same name that was deleted since gives way."""
+        known = self._entries.get(twin.name)
+        return self.replace(twin) if known is None or known.key != twin.key else known
 
     def replace(self, twin: Twin) -> Entry:
         """Take in a twin whose specification has changed."""

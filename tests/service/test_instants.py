@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from service import instants
 from service.errors import BadField
 from service.instants import format_instant, format_instants, parse_instant, parse_instants, parse_parameter
 
@@ -99,3 +100,13 @@ def test_what_is_no_instant(text: str, count: int) -> None:
     with pytest.raises(BadField) as caught:
         parse_instants([*good, text])
     assert caught.value.errors[0][0] == f"time[{count - 1}]"
+
+
+@pytest.mark.parametrize(("behind_s", "kept"), [(-420.0, True), (300.0, True), (0.2, False)])
+def test_a_process_keeps_to_the_clock_that_counts(monkeypatch: pytest.MonkeyPatch, behind_s: float, kept: bool) -> None:
+    """A difference that the time until the answer may explain changes nothing."""
+    monkeypatch.setattr(instants, "_behind_us", 0)
+    monkeypatch.setattr(instants.time, "time_ns", lambda: 1_700_000_000_000_000_000)
+    own_us, asked_ns, answered_ns = 1_700_000_000_000_000, 1_699_999_999_000_000_000, 1_700_000_001_000_000_000
+    instants.keep_to(own_us + round(1e6 * behind_s), asked_ns, answered_ns)
+    assert instants.now_us() == own_us + (round(1e6 * behind_s) if kept else 0)

@@ -11,6 +11,7 @@ from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import by_chance, least_explained
 from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
 from twin_core.discover.judge import (
+    NO_FORESIGHT,
     NO_MORE,
     OUTDONE,
     SMALL_REMAINDER,
@@ -69,8 +70,11 @@ def withdraw(state: Search, needed: float) -> None:
             _examine_again(state, rest, needed)
 
 
-def _examine_again(state: Search, places: Collection[object], needed: float) -> None:
-    """Withdraw the finding at places if by itself it does not pass what any option must; little that it leaves was explained."""
+def _examine_again(state: Search, places: Collection[object], needed: float, *, foresight: float = -np.inf) -> None:
+    """Withdraw the finding at places if by itself it does not pass what any option must; little that it leaves was explained.
+
+    Error on what it was not fitted to, after over before, is enough below ``foresight`` too.
+    """
     without = _attempted_without(state, places)
     finding = next(f for f in state.findings if {effect.place for effect in f.effects} == places)
     if without is None:
@@ -79,7 +83,8 @@ def _examine_again(state: Search, places: Collection[object], needed: float) -> 
     examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
     if examined is None:
         return
-    if examined[0].reason in ("", SMALL_REMAINDER):
+    predicts = examined[0].reason == NO_FORESIGHT and foresight_of(examined[0]) < foresight
+    if predicts or examined[0].reason in ("", SMALL_REMAINDER):
         again = replace(finding, judged=replace(finding.judged, validation=examined[0].validation))
         state.findings = [again if f is finding else f for f in state.findings]
         return
@@ -129,7 +134,8 @@ def prune(state: Search, needed: float) -> None:
     """Drop findings, and members of a set that was found together, that the others have made superfluous.
 
     Beside the others each must be supported by the odds asked for, and explain at one sensor at least what the search would
-    look for. What is left of a set that lost a member is examined as any option: nobody has asked whether it holds alone.
+    look for. What is left of a set that lost a member is examined as any option, for nobody has asked whether it holds alone;
+    as the set has shown its foresight, no more is asked than that the rest predicts no worse.
     """
     for finding in list(state.findings):
         rest = {effect.place for effect in finding.effects}
@@ -141,7 +147,7 @@ def prune(state: Search, needed: float) -> None:
                 _drop(state, {effect.place}, *kept)
                 rest.discard(effect.place)
         if rest and len(rest) < len(finding.effects):
-            _examine_again(state, rest, needed)
+            _examine_again(state, rest, needed, foresight=1.0)
 
 
 def _explains_nothing(without: Trial, trial: Trial) -> bool:

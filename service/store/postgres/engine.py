@@ -66,6 +66,10 @@ def _translated(query: str) -> str:
 
 def connect(url: str) -> "psycopg.Connection[Any]":
     """Return a connection of the driver; Unavailable if the server cannot be reached, without what is secret of the URL."""
+    if (
+        url.partition("?")[0].count("@") > 1
+    ):  # libpq would look for the rest of the password among the hosts, and name it
+        raise Unavailable("write @ as %40 in the user and the password of the database's URL")
     try:
         own = psycopg.conninfo.conninfo_to_dict(url).get("options", "")
         return psycopg.connect(url, autocommit=True, options=f"{OPTIONS} {own}", **SETTINGS)  # type: ignore[arg-type]

@@ -68,6 +68,15 @@ def test_any_of_them_takes_anything(pair: tuple[AppClient, AppClient]) -> None:
     assert sorted(followers) == [False, True] and followers == owners
 
 
+def test_a_twin_deleted_elsewhere_can_be_registered_again_at_once(pair: tuple[AppClient, AppClient]) -> None:
+    one, other = pair
+    one.post("/v1/twins", json=SPEC)
+    until(lambda: other.get(TWIN).status_code == 200)
+    assert other.delete(TWIN).status_code == 204
+    assert one.post("/v1/twins", json=SPEC).status_code == 201
+    assert feed(one, 0)["accepted"] == 60
+
+
 def test_what_one_changes_the_others_know(pair: tuple[AppClient, AppClient]) -> None:
     one, other = pair
     one.post("/v1/twins", json=SPEC)

@@ -49,6 +49,17 @@ def rooms(postgres: str) -> Iterator[Rooms]:
     database.close()
 
 
+@pytest.mark.parametrize("processes", [2, 4, 8])
+@pytest.mark.parametrize("first", [1, 250])
+def test_twins_that_were_registered_one_after_the_other_go_to_all_processes(processes: int, first: int) -> None:
+    """However slots are shared out in runs, nobody has more than two of a few dozen twins more than another."""
+    share = SLOTS // processes
+    counts = [0] * processes
+    for twin in range(first, first + 50):
+        counts[slot_of(twin) // share] += 1
+    assert max(counts) - min(counts) <= 2
+
+
 def test_slots_are_shared_evenly_and_owned_once(rooms: Rooms) -> None:
     assert len(rooms.renew("one").epochs) == SLOTS
     assert rooms.renew("two").epochs == {}  # nothing is free before the first one gives back its surplus

@@ -54,6 +54,8 @@ def test_a_password_is_never_told(tmp_path: Path) -> None:
         f"postgresql://twin:{secret}@127.0.0.1:1/none",
         f"postgresql://127.0.0.1:1/none?user=twin&password={secret}",
         f"postgresql://twin:{secret}@127.0.0.1:{secret}/none",
+        f"postgresql://twin:ab@{secret}@127.0.0.1:1/none",
+        f"postgresql://twin:ab@{secret}#x@127.0.0.1:1/none",
     ):
         with pytest.raises(StoreError) as told:
             Database(url)

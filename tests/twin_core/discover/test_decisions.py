@@ -285,17 +285,19 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
 
 
 @pytest.mark.parametrize(
-    ("nats", "explains", "reason", "kept"),
+    ("nats", "explains", "reason", "foresight", "kept"),
     [
-        (NEEDED + JUST, LEAST_EXCESS + JUST, NO_FORESIGHT, ["a", "b"]),
-        (NEEDED, 9.0, "", ["a"]),
-        (90.0, LEAST_EXCESS - JUST, "", ["a"]),
-        (NEEDED, 9.0, SIZE_NOT_DETERMINED, []),
+        (NEEDED + JUST, LEAST_EXCESS + JUST, NO_FORESIGHT, 2.0, ["a", "b"]),
+        (NEEDED, 9.0, "", 0.5, ["a"]),
+        (90.0, LEAST_EXCESS - JUST, "", 0.5, ["a"]),
+        (NEEDED, 9.0, SIZE_NOT_DETERMINED, 0.5, []),
+        (NEEDED, 9.0, NO_FORESIGHT, 1.0 - JUST, ["a"]),
+        (NEEDED, 9.0, NO_FORESIGHT, 1.0, []),
     ],
-    ids=["enough", "hardly supported", "next to nothing", "the other is nothing by itself"],
+    ids=["enough", "hardly supported", "next to nothing", "nothing by itself", "no worse by itself", "worse by itself"],
 )
 def test_beside_the_others_each_must_be_supported_and_explain_something(
-    monkeypatch: pytest.MonkeyPatch, nats: float, explains: float, reason: str, kept: list[str]
+    monkeypatch: pytest.MonkeyPatch, nats: float, explains: float, reason: str, foresight: float, kept: list[str]
 ) -> None:
     """The search would not look for less: it is no finding because it came with another, which stands alone or not at all."""
     own = {"a": 9.0, "b": 0.5 * explains}  # at one sensor of two twice as much as in the mean
@@ -311,7 +313,10 @@ def test_beside_the_others_each_must_be_supported_and_explain_something(
 
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
     monkeypatch.setattr(revision, "weigh", weighed)
-    monkeypatch.setattr(revision, "examine", lambda simple, option, needed: (replace(option, reason=reason), False))
+    told = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
+    monkeypatch.setattr(
+        revision, "examine", lambda simple, option, needed: (replace(option, validation=told, reason=reason), False)
+    )
     pair = refitted((load("a"), load("b")))
     state = Search(pair, refitted(()), findings=[Finding(Judged(pair.effects, Evidence(99.0, 0.0), pair))])
     prune(state, NEEDED)
