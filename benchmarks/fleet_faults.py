@@ -17,7 +17,8 @@ HEAD = ["fault, under load", *SAMPLES, "jobs lost", "jobs done twice"]
 NOTE = (
     "Samples and jobs of runs on PostgreSQL; each one refused was sent again until it was acknowledged. Twice: stored twice, "
     "and numbers of the stream given twice. Wrong: values or residuals that are not those of a service to which nothing "
-    "happened, by a simple filter that stands in for the twin's, and answers other than 200, 503 and 507. Owned twice: slots whose epochs in the log of tenures overlap, and "
+    "happened, by a simple filter that stands in for the twin's, and answers other than 200, 503 and 507. Owned twice: slots "
+    "whose epochs in the log of tenures overlap, and "
     "turns of two writers of a twin's state in one epoch, as noted by a trigger of the database. Of "
     "jobs, acknowledged counts those queued; done twice are models beyond one of each."
 )
