@@ -42,7 +42,8 @@ def test_healthy_telemetry_loses_nothing(seed: int, step_K: float, noise_K: floa
     assert found(healthy(seed, step_K=step_K, noise_K=noise_K)) == {}
 
 
-@settings(max_examples=25, deadline=None)
+# Of the power of a test that chance has a part in: the same records each time.
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(16, 200))
 def test_frozen_rows_are_found_in_every_channel(seed: int, begin: int, lasting: int) -> None:
     columns = healthy(seed)
@@ -55,7 +56,7 @@ def test_frozen_rows_are_found_in_every_channel(seed: int, begin: int, lasting: 
         assert masks[name]["frozen"][begin + 1 : begin + 1 + lasting].all()
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(45, 200))
 def test_one_frozen_channel_is_found_alone(seed: int, begin: int, lasting: int) -> None:
     columns = healthy(seed)
@@ -63,7 +64,8 @@ def test_one_frozen_channel_is_found_alone(seed: int, begin: int, lasting: int) 
     masks = found(columns)
     assert set(masks) == {"T_b"}
     assert masks["T_b"]["frozen"][begin + 1 : begin + 1 + lasting].all()
-    assert masks["T_b"]["frozen"].sum() <= lasting + 3
+    by_chance = int(np.argmax(columns["T_b"][begin + 1 + lasting :] != columns["T_b"][begin]))
+    assert masks["T_b"]["frozen"].sum() <= lasting + by_chance
 
 
 @settings(max_examples=25, deadline=None)
