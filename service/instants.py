@@ -162,6 +162,9 @@ def format_instant(instant: int) -> str:
     return f"{(_EPOCH_UTC + timedelta(microseconds=instant)).isoformat()}Z"
 
 
+AGREEING_US = 1_000_000
+"""Clocks that differ by less agree: what is late or ahead of time is so by seconds at least."""
+
 _behind_us = 0
 """How far this machine's clock is behind the one that counts, see :func:`keep_to`."""
 
@@ -178,11 +181,11 @@ def keep_to(clock_us: int, asked_ns: int, answered_ns: int) -> None:
     ----------
     clock_us
         What it showed, between the two instants of ``time.time_ns`` at which it was asked and answered. A difference that
-        so long an answer may explain is left as it is.
+        so long an answer may explain, or of clocks that agree, is left as it is.
     """
     global _behind_us
     behind_us = clock_us - (asked_ns + answered_ns) // 2000
-    if abs(behind_us - _behind_us) > (answered_ns - asked_ns) // 1000:
+    if abs(behind_us - _behind_us) > max((answered_ns - asked_ns) // 1000, AGREEING_US):
         _behind_us = behind_us
 
 

@@ -18,6 +18,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time of this machine, which a test may set."""
     now = [1_800_000_000.0]
     monkeypatch.setattr(time, "time_ns", lambda: int(now[0] * 1e9))
+    monkeypatch.setattr("service.fleet.bus.keep_to", lambda *_: None)  # the database has a clock of its own
+    monkeypatch.setattr("service.instants._behind_us", 0)
     return now
 
 
