@@ -41,7 +41,8 @@ def test_block_parser_equals_the_standard_library(timespec: str) -> None:
 @given(st.integers(0, 7_258_118_399_999_999))
 def test_round_trips(instant: int) -> None:
     assert parse_instant(format_instant(instant), "t") == instant
-    assert parse_instants([instant / 1e6]).tolist() == [instant]
+    if instant < 2**32 * 10**6:  # from 2106 on two doubles of a second lie almost a microsecond apart
+        assert parse_instants([instant / 1e6]).tolist() == [instant]
 
 
 def test_fractions_beyond_the_microsecond_are_rounded() -> None:
