@@ -16,6 +16,7 @@ from service.live.position import Position, is_far, next_count
 from service.live.progress import ahead, save
 from service.store import samples
 from service.store.database import Database
+from service.store.errors import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.stream.hub import Hub
@@ -107,7 +108,13 @@ class Scout:
             fresh = await self._following.opened(fresh)
         try:
             done = await self._following.filter(self._active, before, fresh)
-        except Exception as error:  # whatever it is, it would come again with the same samples
+        except TwinGone:
+            raise
+        except (
+            Exception
+        ) as error:  # whatever it is, unless it is the database, it would come again with the same samples
+            if self._database.is_fault(error):
+                raise
             if self._caution.failed(fresh.time_us, 0):
                 self._after_us = int(fresh.time_us[-1])
             log.info("the newest samples cannot be followed", extra={"twin": self._twin.name, "reason": str(error)})

@@ -18,7 +18,7 @@ from service.monitoring import tracing
 from service.monitoring.metrics import Metrics
 from service.store import models
 from service.store.database import Database
-from service.store.errors import LeaseLost, TwinGone
+from service.store.errors import DiskFull, LeaseLost, TwinGone, Unavailable
 from service.store.models import Active
 from service.store.samples import Samples
 from service.stream.hub import Hub
@@ -166,14 +166,22 @@ class Tracker:
                 await self._take_in()
             except (TwinGone, LeaseLost):
                 return
+            except (Unavailable, DiskFull) as error:
+                extra = {"twin": self.twin.name, "reason": type(error).__name__}
+                log.warning("assimilation waits for the database", extra=extra)
+                await self._try_again()
             except Exception as error:
                 self.trouble = f"{type(error).__name__}: {error}"
                 log.exception("assimilation failed unexpectedly", extra={"twin": self.twin.name})
-                self._wake.set()
-                await asyncio.sleep(RETRY_S)
+                await self._try_again()
             if not self._wake.is_set():
                 self._idle.set()
             await asyncio.sleep(PAUSE_S)
+
+    async def _try_again(self) -> None:
+        """Wait a little before the next attempt, to which everything is still to be done."""
+        self._wake.set()
+        await asyncio.sleep(RETRY_S)
 
     async def _take_in(self) -> None:
         if self._new_model:
@@ -209,8 +217,15 @@ class Tracker:
             self._idle.set()
 
     async def _load(self) -> None:
-        """Find the active model and where its assimilation stands."""
+        """Find the active model and where its assimilation stands; what fails is to be done again."""
         self._new_model, anew, self._begin_anew = False, self._begin_anew, False
+        try:
+            await self._find(anew)
+        except Exception:
+            self._new_model, self._begin_anew = True, anew or self._begin_anew
+            raise
+
+    async def _find(self, anew: bool) -> None:
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
             self.active, self.catching_up, self._detour = None, False, None
@@ -290,7 +305,13 @@ class Tracker:
         try:
             with tracing.part("filter", _told(self.twin, active, fresh), cause=self.twin.key):
                 done = await self._following.filter(active, before, fresh)
-        except Exception as error:  # whatever it is, it would come again with the same samples
+        except TwinGone:
+            raise
+        except (
+            Exception
+        ) as error:  # whatever it is, unless it is the database, it would come again with the same samples
+            if self._database.is_fault(error):
+                raise
             self.trouble = str(error) if isinstance(error, TwinError | Refusal) else f"{type(error).__name__}: {error}"
             if caution.failed(fresh.time_us, reading.seq):
                 self._metrics.skipped.inc(int(fresh.time_us.size))

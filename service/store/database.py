@@ -16,7 +16,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from service.store.connection import Connection
 from service.store.engine import Engine
-from service.store.errors import Unavailable
+from service.store.errors import DiskFull, Unavailable
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -57,11 +57,15 @@ class Database:
         """Open and migrate it; StoreError if that is impossible."""
         self.engine = open_engine(place)
         self._session = self.engine.session()
-        self._faults: tuple[type[Exception], ...] = (*self.engine.faults, Unavailable)
+        self._faults: tuple[type[Exception], ...] = (*self.engine.faults, Unavailable, DiskFull)
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
         self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="reader")
         self._writer = threading.Thread(target=self._write_forever, name="writer", daemon=True)
         self._writer.start()
+
+    def is_fault(self, error: Exception) -> bool:
+        """Return whether an operation failed over the database, not over what it was to do."""
+        return isinstance(error, self._faults)
 
     @property
     def is_shared(self) -> bool:

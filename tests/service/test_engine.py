@@ -42,6 +42,21 @@ def test_what_comes_while_a_batch_is_under_way_goes_together() -> None:
     assert [one for k, one in enumerate(found) if k not in (4, 8)] == [0, 10, 20, 30, 50, 60, 70, 90]
 
 
+def test_whoever_asks_as_soon_as_it_is_answered_is_answered_again() -> None:
+    """The task that found nothing more to ask has not ended yet when the next question comes."""
+
+    async def ask(questions: list[int]) -> Sequence[int | Exception]:
+        await asyncio.sleep(0.0)
+        return questions
+
+    async def talk() -> list[int]:
+        batches = Batches(ask, at_once=1, most=5)
+        async with asyncio.timeout(10.0):
+            return [await batches.ask(q) for q in range(3)]
+
+    assert asyncio.run(talk()) == [0, 1, 2]
+
+
 def test_a_batch_that_cannot_be_asked_fails_for_all_that_are_in_it() -> None:
     async def ask(questions: list[int]) -> Sequence[int | Exception]:
         raise ZeroDivisionError

@@ -6,11 +6,13 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
 
-from service.live import forecasts
+from service.live import following, forecasts, tracker
+from service.store.errors import Unavailable
 from service.stream import past
 from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC, Sql
@@ -111,6 +113,39 @@ def test_samples_that_cannot_be_assimilated_are_skipped(client: AppClient, unfit
     assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).status_code == 200
     send(client, [300], [SCALE_K * 101])
     assert residuals(client)["1970-01-01T00:05:00Z"] == SCALE_K
+
+
+@pytest.mark.parametrize(
+    ("module", "room", "name"),
+    [(tracker, "progress", "lift_floor"), (tracker, "progress", "resume"), (following, "samples", "select")],
+)
+def test_an_outage_of_the_database_costs_no_residual(
+    client: AppClient, monkeypatch: pytest.MonkeyPatch, module: ModuleType, room: str, name: str
+) -> None:
+    """Whatever of the assimilation it meets is done again, the start with a model too, without anybody having to ask."""
+    squares(client)
+
+    async def settled(self: tracker.Tracker, timeout_s: float) -> bool:
+        return True
+
+    monkeypatch.setattr(tracker.Tracker, "settled", settled)
+    failures = iter([Unavailable("the database cannot be reached")] * 2)
+    works = vars(getattr(module, room))
+
+    def fails_at_first(*args: object) -> object:
+        if (failure := next(failures, None)) is not None:
+            raise failure
+        return works[name](*args)
+
+    monkeypatch.setattr(tracker, "RETRY_S", 0.1)
+    monkeypatch.setattr(module, room, SimpleNamespace(**works | {name: fails_at_first}))
+    calibrate(client)
+    for k in range(100, 103):
+        send(client, [k], [SCALE_K * k * k])
+    until(lambda: len(residuals(client, version=2)) == 103)
+    assert next(failures, None) is None
+    np.testing.assert_allclose(list(residuals(client).values())[1:], [SCALE_K * (2 * k - 1) for k in range(1, 103)])
+    assert "twin_skipped_samples_total 0.0" in client.get("/metrics").text
 
 
 def test_an_archive_that_cannot_be_assimilated_says_why(client: AppClient) -> None:

@@ -12,8 +12,8 @@ from twin_core.quality.policy import LEAST_READINGS
 
 FINE = 3.0
 """Typical change over the smallest distance between two readings, above which repeats are held: from code to code of a
-converter it is one or two. Of 600 channels of coarse, uneven converters 291 were taken for held without it, 94 at half of it, none
-at it and at twice; of 600 held ones all were found each time."""
+converter it is one or two. Of 600 channels of coarse, uneven converters 291 were taken for held without it, 94 at half of it,
+none at it and at twice; of 600 held ones all were found each time."""
 
 SMALLEST = 0.02
 """Quantile that stands for the smallest distance."""

@@ -31,8 +31,16 @@ SETTINGS = {
     "keepalives_count": 3,
     "tcp_user_timeout": 8000,
 }
-OPTIONS = "-c synchronous_commit=on -c idle_in_transaction_session_timeout=60000 -c lock_timeout=20000"
-"""A client that vanishes inside a transaction holds its locks no longer than that."""
+IDLE_S = 5
+"""A client that vanishes inside of a transaction, by a cut cable say, holds its locks no longer: as long as a lease lasts."""
+OPTIONS = f"-c synchronous_commit=on -c idle_in_transaction_session_timeout={1000 * IDLE_S} -c lock_timeout=20000"
+
+PASSING = (
+    errors.DeadlockDetected,
+    errors.SerializationFailure,
+    errors.CheckViolation,
+    errors.IdleInTransactionSessionTimeout,
+)
 
 
 class Speaking:
@@ -216,15 +224,18 @@ class PostgresEngine:
                 speaking.driver.close()
 
     def is_passing(self, error: Exception) -> bool:
-        """Return whether transactions stood in each other's way, or a partition was dropped that a segment was to go into."""
-        return isinstance(error, errors.DeadlockDetected | errors.SerializationFailure | errors.CheckViolation)
+        """Return whether transactions stood in each other's way, a partition was dropped that a segment was to go into, or this
+        process stood still for so long that its transaction was ended."""
+        return isinstance(error, PASSING)
 
     def refusal(self, error: Exception) -> Exception:
         """Return what the caller is told about a fault."""
         if isinstance(error, errors.DiskFull):
             log.error("the database's disk is full; nothing of the write was stored")
             return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
-        if isinstance(error, psycopg.OperationalError | errors.ReadOnlySqlTransaction):
+        if isinstance(
+            error, psycopg.OperationalError | errors.ReadOnlySqlTransaction | errors.IdleInTransactionSessionTimeout
+        ):
             log.error("the database does not answer", extra={"reason": _without_secrets(error, self.url)})
             return Unavailable("the database cannot be reached; send it again: what is stored already is recognised")
         return error

@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import psycopg
 
-from service.store import models, residuals, samples, twins
+from service.store import models, ownership, residuals, samples, twins
 from service.store.connection import Connection
 from service.store.database import Database
 from tests.service.conftest import SPEC
@@ -26,20 +26,22 @@ REPORT = os.environ.get("FLEET_FAULTS")
 KEY = "secret"
 BEGIN_S = 1_700_000_000
 MODEL = {"rmse_K": 0.1, "max_step_s": 60.0, "spec": SPEC, "effects": []}
-WITNESS = """
+WITNESS = f"""
     CREATE TABLE written (
         number BIGINT GENERATED ALWAYS AS IDENTITY PRIMARY KEY, twin BIGINT, epoch BIGINT, writer TEXT
     );
     CREATE FUNCTION witness() RETURNS trigger LANGUAGE plpgsql AS $$BEGIN
         INSERT INTO written (twin, epoch, writer)
         SELECT NEW.twin, slot.epoch, host(inet_client_addr()) || ':' || inet_client_port()
-        FROM slot WHERE slot.number = mod(NEW.twin, 256);
+        FROM slot WHERE slot.number = mod(NEW.twin * {ownership.SPREAD}, {ownership.SLOTS});
         RETURN NULL;
     END$$;
     CREATE TRIGGER witness AFTER INSERT OR UPDATE ON checkpoint FOR EACH ROW EXECUTE FUNCTION witness();
 """
 """The database notes by itself which connection writes the live state of a twin in which epoch."""
 SKEWED = "import time; real = time.time_ns; time.time_ns = lambda: real() + {skew_s} * 10**9;" + FAKE
+STARTED: list["Load"] = []
+"""What may still be sending: a test that fails leaves its load behind."""
 
 
 def names(count: int) -> list[str]:
@@ -92,13 +94,18 @@ class Load:
         self.refused = 0
         self.wrong: list[str] = []
         """Answers that no client should get: every test fails if there is one."""
-        self._threads = [threading.Thread(target=self._send, args=(names(count)[k::2],)) for k in range(2)]
+        self._threads = [threading.Thread(target=self._send, args=(names(count)[k::2],), daemon=True) for k in range(2)]
+        STARTED.append(self)
         for thread in self._threads:
             thread.start()
 
+    def stop(self) -> None:
+        """Send nothing more."""
+        self._stop.set()
+
     def end(self) -> None:
         """Stop after what is under way."""
-        self._stop.set()
+        self.stop()
         for thread in self._threads:
             thread.join(60)
             assert not thread.is_alive(), "a request has had no answer for a minute"

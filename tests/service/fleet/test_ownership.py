@@ -120,6 +120,33 @@ def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms, postgres: str) -> 
     assert order[0] == "written" and sorted(order[1:]) == ["answered None", "taken over"]
 
 
+def test_a_process_that_vanishes_inside_of_a_transaction_holds_nobody_up(rooms: Rooms, postgres: str) -> None:
+    """Nobody tells the database that a cable was cut: it ends the transaction by itself, before others give up waiting."""
+    is_under_way, may_end = threading.Event(), threading.Event()
+
+    def vanishes(connection: Connection) -> None:
+        is_under_way.set()
+        may_end.wait(60)
+
+    ended: list[BaseException | None] = []
+    rooms.database.submit_to(rooms.twin, lambda result, error: ended.append(error), vanishes)
+    assert is_under_way.wait(30)
+    other = Database(postgres)
+    written = threading.Event()
+    refused: list[BaseException | None] = []
+
+    def answered(result: object, error: BaseException | None) -> None:
+        refused.append(error)
+        written.set()
+
+    other.submit_to(rooms.twin, answered, lambda connection: None)
+    assert written.wait(60) and refused == [None]
+    may_end.set()
+    other.close()
+    rooms.do(lambda connection: None)
+    assert ended == [None]  # it was done again on a new connection
+
+
 def test_leaving_gives_everything_back_at_once(rooms: Rooms) -> None:
     rooms.renew("one")
     rooms.do(ownership.give_back, "one")
