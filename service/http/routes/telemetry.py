@@ -74,7 +74,9 @@ async def ingest(request: Request, twin: TwinName) -> Response:
         now = await service.find_now(twin)
         if now is entry:
             raise
-    return await _take(service, now, body, parse)  # another process has given it channels, or put it in place of another one
+    return await _take(
+        service, now, body, parse
+    )  # another process has given it channels, or put it in place of another one
 
 
 async def _take(service: Service, entry: Entry, body: bytes, parse: Callable[[bytes, Units], Batch]) -> Response:

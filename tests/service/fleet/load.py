@@ -39,6 +39,12 @@ WITNESS = f"""
     CREATE TRIGGER witness AFTER INSERT OR UPDATE ON checkpoint FOR EACH ROW EXECUTE FUNCTION witness();
 """
 """The database notes by itself which connection writes the live state of a twin in which epoch."""
+WORKER = FAKE.replace("service.server import serve", "service.worker import work").replace(
+    "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)",
+    "work(read_settings(), lambda: print('listening on', 'nothing', flush=True), FakeWorkbench)",
+)
+"""A process that does jobs and serves nobody."""
+LOGGED = "from service.monitoring.logs import start_logging; start_logging('info');"
 SKEWED = "import time; real = time.time_ns; time.time_ns = lambda: real() + {skew_s} * 10**9;" + FAKE
 STARTED: list["Load"] = []
 """What may still be sending: a test that fails leaves its load behind."""

@@ -19,6 +19,7 @@ from tests.service.fakes import GATE
 from tests.service.fleet.load import (
     KEY,
     SKEWED,
+    WORKER,
     Load,
     assert_jobs_done_once,
     assert_nothing_lost,
@@ -329,11 +330,7 @@ def test_a_worker_is_killed(tmp_path: Path, postgres: str, monkeypatch: pytest.M
     prepare(postgres, 1)
     gate = tmp_path / "gate"
     monkeypatch.setenv(GATE, str(gate))
-    worker = FAKE.replace("service.server import serve", "service.worker import work").replace(
-        "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)",
-        "work(read_settings(), lambda: print('listening on', 'nothing', flush=True), FakeWorkbench)",
-    )
-    with fleet(tmp_path, [postgres] * 3, [FAKE, worker, worker]) as (service, *workers):
+    with fleet(tmp_path, [postgres] * 3, [FAKE, WORKER, WORKER]) as (service, *workers):
         jobs = calibrations(service, 3)
 
         def held() -> dict[str, str]:
