@@ -61,7 +61,7 @@ class Settings(BaseSettings):
     )
     executor: str = Field(
         "process",
-        pattern=r"^(process|dask://[^/]+)$",
+        pattern=r"^(process|dask://[^/]+:[0-9]+)$",
         description="Where jobs compute: `process`, or `dask://HOST:PORT`, the scheduler of a Dask cluster.",
     )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")

@@ -139,8 +139,9 @@ class Tracker:
     async def settled(self, timeout_s: float) -> bool:
         """Return whether everything stored when this was asked is assimilated, after waiting for it a while.
 
-        A tracker that has ended, since another process follows the twin now, assimilates nothing more. The database is asked what that is: word of a model or of samples comes after their commit, from another process later
-        still, and whoever saw the commit may ask before it comes.
+        The database is asked what that is: word of a model or of samples comes after their commit, from another process later
+        still, and whoever saw the commit may ask before it comes. A tracker that has ended, since another process follows the
+        twin now, assimilates nothing more.
         """
         seq, version = await self._database.read(progress.stands, self.twin.key)
         if version != (None if self.active is None else self.active.version):
