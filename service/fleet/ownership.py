@@ -6,12 +6,11 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from service.store import ownership
 from service.store.connection import Connection
-from service.store.ownership import Holding, slot_of
+from service.store.ownership import LEASE_S, Holding, slot_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-LEASE_S = 5.0
 BEAT_S = 1.0
 
 
