@@ -1,7 +1,10 @@
 """What every test shares: a clean environment, and a small twin of two nodes with telemetry."""
 
 import copy
+import faulthandler
 import os
+import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -25,6 +28,20 @@ PAIR: dict[str, Any] = {
     "radiators": [{"node": "a", "emissivity": 0.8, "area_m2": 0.2, "sink": "space"}],
     "loads": [{"channel": "Q_a", "node": "a"}],
 }
+
+END_S = 60.0
+"""So long a run waits at its end for threads that a failed test has left behind."""
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End the process although threads go on that a failed test did not stop: Python would wait for them for ever."""
+
+    def end() -> None:
+        time.sleep(END_S)
+        faulthandler.dump_traceback(all_threads=True)
+        os._exit(pytest.ExitCode.INTERNAL_ERROR)
+
+    threading.Thread(target=end, daemon=True).start()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

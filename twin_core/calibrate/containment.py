@@ -48,7 +48,8 @@ def check_time() -> None:
 
     Iterations call it once each, and so does each segment and each stretch of an evaluation, which may be long.
     """
-    if is_late(_limit.get()) or time.thread_time() >= _cpu_limit.get():
+    cpu_limit = _cpu_limit.get()
+    if is_late(_limit.get()) or (cpu_limit < NO_DEADLINE and time.thread_time() >= cpu_limit):
         raise TimeIsUpError("the time is up")
 
 

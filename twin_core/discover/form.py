@@ -1,7 +1,11 @@
 """The form of a finding: a name stands for a law, so nothing that repeats with temperature may be left where it acts,
 and the declared quantities must be left where they may be."""
 
+import os
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import Context, copy_context
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,30 +16,42 @@ from twin_core.effects.base import Effect, touched_nodes
 N_REFITS, N_RIVALS = 6, 2
 
 
-def leaves_a_repeatable_heat(trial: Trial, effects: Sequence[Effect], needed: float, most: float) -> float | None:
-    """Return what a free form of temperature removes on top of named effects, at the nodes where they act, if it is supported.
+@dataclass(frozen=True)
+class Repeatable:
+    """The likeliest free form of temperature on top of a trial.
 
-    A law that merely resembles what is missing leaves the difference behind: not noise, not a wandering heat, but one
-    that comes back with the temperature. Then the heat is repeatable and the name is not.
+    Attributes
+    ----------
+    log_bayes_factor
+        For it; minus infinity where none is worth a refit.
+    removed
+        By how much it lowers the variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
+    """
+
+    log_bayes_factor: float = -np.inf
+    removed: float = 0.0
+
+
+def repeatable_heat(trial: Trial, nodes: Collection[str], needed: float) -> Repeatable:
+    """Return what a free form of temperature removes on top of a trial, at some nodes.
+
+    A law that merely resembles what is missing leaves the difference behind where it acts: not noise, not a wandering heat,
+    but one that comes back with the temperature. Then the heat is repeatable and the name is not. If more of it is left
+    elsewhere, it is no remainder of the name: something else is missing, or the network is coarse.
 
     Parameters
     ----------
     trial
-        With the effects, fitted.
-    effects
-        Those of the trial that are to be named.
+        With the effects that are to be named, fitted.
+    nodes
+        Where the free form may act.
     needed
         Log Bayes factor from which a free form is worth a refit.
-    most
-        Log Bayes factor up to which what is left does not count.
-
-    Returns
-    -------
-    float, or None
-        Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
-    worth, top = _likeliest_on_top(trial, _where(trial, effects), needed)
-    return mean_excess(trial) - mean_excess(top) if worth > most else None
+    best, n_tried = _free_forms(trial, nodes, needed)
+    for top in _likeliest(trial, _refitted(trial, best[:N_REFITS])):
+        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, mean_excess(trial) - mean_excess(top))
+    return Repeatable()
 
 
 def outdone_by_a_free_form(
@@ -50,40 +66,52 @@ def outdone_by_a_free_form(
     ----------
     simple
         Without the effects.
-    trial, effects, needed, most
-        As in :func:`leaves_a_repeatable_heat`, and what is returned as well.
+    trial, effects
+        With the effects, fitted, and those that are to be named.
+    needed
+        Log Bayes factor from which a free form is worth a refit.
+    most
+        Log Bayes factor up to which what is left does not count.
+
+    Returns
+    -------
+    float, or None
+        Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
-    best, _ = _free_forms(simple, _where(simple, effects), needed)
-    instead = [try_effects(simple, (*simple.effects, effect), n_passes=6, quick=True) for effect in best[:N_RIVALS]]
-    likelier = [rival for rival in _likeliest(simple, instead) if weigh(rival, trial, 1).log_bayes_factor < -most]
+    best, _ = _free_forms(simple, acts_at(simple, effects), needed)
+    instead = _likeliest(simple, _refitted(simple, best[:N_RIVALS]))
+    likelier = [rival for rival in instead if weigh(rival, trial, 1).log_bayes_factor < -most]
     return max((mean_excess(trial) - mean_excess(rival) for rival in likelier), default=None)
 
 
-def more_is_left_elsewhere(trial: Trial, effects: Sequence[Effect], needed: float) -> bool:
+def more_is_left_elsewhere(
+    trial: Trial, effects: Sequence[Effect], needed: float, here: Repeatable | None = None
+) -> bool:
     """Return whether a free form of temperature on top of named effects is likelier away from where they act than there.
-
-    What repeats with temperature then is no remainder of theirs: something else is missing, or the network is coarse.
 
     Parameters
     ----------
-    trial, effects, needed
-        As in :func:`leaves_a_repeatable_heat`.
+    trial, effects
+        With the effects, fitted, and those that are to be named.
+    needed
+        Log Bayes factor from which a free form is worth a refit.
+    here
+        The likeliest one where they act; None where it is not known yet.
     """
-    own = _where(trial, effects)
-    away, _ = _likeliest_on_top(trial, set(trial.fit.network.layout.nodes) - own, needed)
-    return away > needed and away > _likeliest_on_top(trial, own, needed)[0]
+    own = acts_at(trial, effects)
+    away = repeatable_heat(trial, set(trial.fit.network.layout.nodes) - own, needed).log_bayes_factor
+    return away > needed and away > (here or repeatable_heat(trial, own, needed)).log_bayes_factor
 
 
-def _likeliest_on_top(trial: Trial, nodes: Collection[str], needed: float) -> tuple[float, Trial]:
-    """Return the log Bayes factor of the likeliest free form at some nodes on top of a trial, and the trial with it.
+def _refitted(trial: Trial, effects: Sequence[Effect]) -> list[Trial]:
+    """Return a trial with each of some effects on top, side by side, under the same deadline."""
+    contexts = [copy_context() for _ in effects]
 
-    Minus infinity and the trial as it is where none is worth a refit.
-    """
-    best, n_tried = _free_forms(trial, nodes, needed)
-    tops = [try_effects(trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in best[:N_REFITS]]
-    for top in _likeliest(trial, tops):
-        return weigh(trial, top, n_tried).log_bayes_factor, top
-    return -np.inf, trial
+    def fitted(context: Context, effect: Effect) -> Trial:
+        return context.run(try_effects, trial, (*trial.effects, effect), n_passes=6, quick=True)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(fitted, contexts, effects))
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
@@ -91,7 +119,7 @@ def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
     return sorted(options, key=lambda trial: -weigh(simple, trial, 1, quick=True).log_bayes_factor)[:1]
 
 
-def _where(trial: Trial, effects: Sequence[Effect]) -> set[str]:
+def acts_at(trial: Trial, effects: Sequence[Effect]) -> set[str]:
     """Return the nodes at which effects act."""
     return {node for effect in effects for node in touched_nodes(effect, trial.fit.network.layout)}
 

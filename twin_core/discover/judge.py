@@ -14,7 +14,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
-from twin_core.discover.form import leaves_a_repeatable_heat, more_is_left_elsewhere, outdone_by_a_free_form
+from twin_core.discover.form import Repeatable, acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
@@ -227,11 +227,13 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
         return ""
     heats = [effect for effect in named if "sensor" not in effect.where]
     most = most_left(judged.evidence.log_bayes_factor, needed)
+    trial = judged.trial
     with ThreadPoolExecutor(1) as pool:  # side by side, under the same deadline
-        other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, judged.trial, named, needed, most)
-        beside = leaves_a_repeatable_heat(judged.trial, heats, needed, most) if heats else None
-    left = [removed for removed in (beside, other.result()) if removed is not None]
-    if not left or more_is_left_elsewhere(judged.trial, named, needed):
+        other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, trial, named, needed, most)
+        beside = repeatable_heat(trial, acts_at(trial, heats), needed) if heats else Repeatable()
+    left = [beside.removed] if beside.log_bayes_factor > most else []
+    left += [removed for removed in [other.result()] if removed is not None]
+    if not left or more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
         return ""
     little = policy.REPEATABLE_SHARE * (mean_excess(simple) - mean_excess(judged.trial))
     return SMALL_REMAINDER if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW

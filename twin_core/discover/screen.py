@@ -4,7 +4,9 @@ The linearised response of the sensors to every candidate is propagated at once 
 whitened in the metric of sensor noise and undeclared heat, and projected off what the calibrated parameters can mimic.
 """
 
+import os
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -206,13 +208,19 @@ def screen_sizes(
     """
     nuisance = [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals]
     sized = [replace(fit, undeclared=replace(fit.undeclared, std_W=share * fit.undeclared.std_W)) for share in shares]
-    grounds = [(one, *_nuisance(one, nuisance)) for one in sized]
-    probes: list[list[Probe]] = [[] for _ in shares]
-    n_tried = 0
-    for effects, edges, blocks in _portions(fit, survey, candidates):
-        n_tried += len(effects)
-        for found, (one, basis, residual) in zip(probes, grounds, strict=True):
-            found += _probes(effects, edges, _whitened(one, blocks), basis, residual)
+    n_tried, probes, under_way = 0, [list[Probe]() for _ in shares], list[Future[list[Probe]]]()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # sizes side by side, while the next responses are calculated
+        grounds = list(pool.map(lambda one: _nuisance(one, nuisance), sized))
+        for effects, edges, blocks in _portions(fit, survey, candidates):
+            n_tried += len(effects)
+            for found, done in zip(probes, under_way, strict=False):
+                found += done.result()
+            under_way = [
+                pool.submit(_probes, effects, edges, one, blocks, *ground)
+                for one, ground in zip(sized, grounds, strict=True)
+            ]
+        for found, done in zip(probes, under_way, strict=False):
+            found += done.result()
     return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
 
 
@@ -255,15 +263,21 @@ def _portions(
 
 
 def _probes(
-    effects: Sequence[Effect], edges: Sequence[int], whitened: FloatArray, basis: FloatArray, residual: FloatArray
+    effects: Sequence[Effect],
+    edges: Sequence[int],
+    fit: HeatFit,
+    blocks: Sequence[FloatArray],
+    basis: FloatArray,
+    residual: FloatArray,
 ) -> list[Probe]:
     """Return the probes of candidates that the data tell and whose best amplitudes are physical.
 
-    ``edges`` are where the columns of each begin and end in the responses ``whitened`` (n_rows, n_columns). ``basis``
+    ``edges`` are where the columns of each begin and end in the responses ``blocks``, which a fit whitens. ``basis``
     (n_rows + n_free, n_basis) is orthonormal, off it ``residual`` (n_rows + n_free,) is projected: P'P = W'W - (B'W)'(B'W) and
     P'r = W'r of the projected responses P, which need not be formed. Candidates with equally many amplitudes go through the
     algebra at once; those whose responses are no numbers are left out.
     """
+    whitened = _whitened(fit, blocks)
     n_rows = whitened.shape[0]
     along, inside = residual[:n_rows] @ whitened, basis[:n_rows].T @ whitened
     columns = np.ascontiguousarray(whitened.T)

@@ -17,6 +17,7 @@ from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
 from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
+from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
@@ -31,7 +32,7 @@ from twin_core.discover.revision import exchange, prune, reconsider, tell_altern
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import extend_by_trajectory
-from twin_core.effects.base import Effect, Place, touched_nodes
+from twin_core.effects.base import Effect, Place
 
 MAX_FINDINGS = 4
 N_REFITS = 12
@@ -203,9 +204,9 @@ def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int)
         judged = sorted(quick, key=worth)
         best = judged[0].evidence.log_bayes_factor if judged else 0.0
         near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
-        here = _acts_at(judged[0]) if judged else set()
+        here = acts_at(judged[0].trial, judged[0].effects) if judged else set()
         likely = [j for j in judged if j.evidence.log_bayes_factor > best - SETTLING_NATS]
-        rivals = [*quick[:N_FIRST], *[j for j in likely if _acts_at(j) == here][:N_FORMS]]
+        rivals = [*quick[:N_FIRST], *[j for j in likely if acts_at(j.trial, j.effects) == here][:N_FORMS]]
         near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
         settled = _done(pool.map(lambda j: fitted(j.trial, j.effects, 12), near))
         rest = [j for j in judged if all(j is not n for n in near)]
@@ -231,7 +232,8 @@ def _forms_of_the_best(settled: Sequence[Judged]) -> list[Judged]:
     best = min(settled, key=worth)
     near = [j for j in settled if j.evidence.log_bayes_factor > best.evidence.log_bayes_factor - RIVAL_NATS]
     simple = [j for j in near if j.trial.fit.problem.n_free <= best.trial.fit.problem.n_free]
-    rivals = [j for j in simple if _acts_at(j) == _acts_at(best)]
+    here = acts_at(best.trial, best.effects)
+    rivals = [j for j in simple if acts_at(j.trial, j.effects) == here]
     return rivals if len({j.trial.effects[-1].place for j in rivals}) > 1 else []
 
 
@@ -239,12 +241,6 @@ def _from_trajectories(state: Search, judged: Judged, n_tried: int) -> Judged:
     """Return an option fitted from its open-loop optimum too, at the likelier of both fits."""
     trial = resettled(state.trial, judged.trial)
     return Judged(trial.effects[len(state.trial.effects) :], weigh(state.trial, trial, n_tried), trial)
-
-
-def _acts_at(judged: Judged) -> set[str]:
-    """Return the nodes at which the effects of an option act."""
-    layout = judged.trial.fit.network.layout
-    return {node for effect in judged.effects for node in touched_nodes(effect, layout)}
 
 
 def _judge(

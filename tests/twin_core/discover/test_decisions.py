@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from twin_core.discover import judge, policy, revision
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.form import Repeatable
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
@@ -434,7 +435,9 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
 ) -> None:
     option = judged("a", 90.0, left=1.0)
     simple = stub(left=10.0 if left == 1.0 else left)
-    monkeypatch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: beside)
+    found = Repeatable() if beside is None else Repeatable(9e9, beside)
+    monkeypatch.setattr(judge, "acts_at", lambda *arguments: {"a"})
+    monkeypatch.setattr(judge, "repeatable_heat", lambda *arguments: found)
     monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
     monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
     assert judge._merely_resembles(simple, option, NEEDED) == reason
@@ -448,7 +451,7 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
     option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
-        patch.setattr(judge, "leaves_a_repeatable_heat", lambda *arguments: 1e9)
+        patch.setattr(judge, "repeatable_heat", lambda *arguments: Repeatable(9e9, 1e9))
         patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
         patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: 1e9)

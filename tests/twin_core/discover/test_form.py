@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
-from twin_core.discover.form import leaves_a_repeatable_heat, more_is_left_elsewhere, outdone_by_a_free_form
+from twin_core.discover.form import acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
 from twin_core.discover.revision import prune
 from twin_core.discover.screen import screen, survey_of
@@ -97,7 +97,7 @@ def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[
     worth = weigh(base, trial, 1).log_bayes_factor
     assert worth > NEEDED  # either way the heater looks well supported
     most = most_left(worth, NEEDED)
-    assert (leaves_a_repeatable_heat(trial, trial.effects, NEEDED, most) is not None) is left
+    assert (repeatable_heat(trial, acts_at(trial, trial.effects), NEEDED).log_bayes_factor > most) is left
     assert (outdone_by_a_free_form(base, trial, trial.effects, NEEDED, most) is not None) is left
 
 
@@ -149,6 +149,8 @@ def test_what_repeats_elsewhere_is_no_remainder_of_a_name(
         (try_effects(base, [probe.effect], n_passes=15) for probe in probes), key=lambda trial: trial.fit.log_posterior
     )
     assert more_is_left_elsewhere(trial, trial.effects, NEEDED) is elsewhere
+    here = repeatable_heat(trial, acts_at(trial, trial.effects), NEEDED)
+    assert more_is_left_elsewhere(trial, trial.effects, NEEDED, here) is elsewhere
 
 
 def test_a_single_node_has_no_elsewhere() -> None:
