@@ -94,7 +94,7 @@ class Load:
     """Sends samples of every twin to whichever service answers, each again until it is acknowledged."""
 
     def __init__(self, urls: Callable[[], list[str]], count: int, begin_s: int = BEGIN_S) -> None:
-        """Begin to send to the services that there are at a time: samples of the seconds from ``begin_s`` on, none ahead of time."""
+        """Begin to send to the services that there are at a time: samples of the seconds from ``begin_s`` on, up to now."""
         self._urls, self._stop, self.begin_s = urls, threading.Event(), begin_s
         self.sent = {name: 0 for name in names(count)}
         self.refused = 0
