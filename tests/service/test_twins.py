@@ -61,16 +61,19 @@ def test_registering_while_the_same_twin_is_deleted_leaves_no_half_of_it(
     route = "/v1/twins/benchsat"
     jobs = client.app.state.service.jobs
     cancel = jobs.cancel_twin
+    has_begun = asyncio.Event()
 
     async def slowly(twin: Entry) -> None:
+        has_begun.set()
         await asyncio.sleep(0.1)
         await cancel(twin)
 
     monkeypatch.setattr(jobs, "cancel_twin", slowly)
 
     async def rush() -> list[int]:
-        register = client.http.post("/v1/twins", json=SPEC)
-        answers = await asyncio.gather(client.http.delete(route), client.http.delete(route), register)
+        deletions = [asyncio.create_task(client.http.delete(route)) for _ in range(2)]
+        await has_begun.wait()
+        answers = await asyncio.gather(*deletions, client.http.post("/v1/twins", json=SPEC))
         return [answer.status_code for answer in answers]
 
     client.post("/v1/twins", json=SPEC)
