@@ -112,7 +112,7 @@ def test_a_table_is_the_same_without_its_derivatives(knots: list[int], x: list[f
         told = table.evaluate(along, values)
         told_alone = table.evaluate(replace(along, derivatives=False), values)
         np.testing.assert_allclose(told_alone.heat_W, told.heat_W, rtol=1e-12, atol=1e-12)
-        of_entries = sum(entry.series * values[entry.item] for entry in told.d_parameters)
+        of_entries = sum(entry.series * values[entry.item] for entry in told.d_values)
         np.testing.assert_allclose(of_entries, told.heat_W[:, 0], rtol=1e-12, atol=1e-12)
 
 
