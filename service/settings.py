@@ -61,7 +61,7 @@ class Settings(BaseSettings):
     )
     executor: str = Field(
         "process",
-        pattern=r"^(process|dask://[^/]+)$",
+        pattern=r"^(process|dask://[^/]+:[0-9]+)$",
         description="Where jobs compute: `process`, or `dask://HOST:PORT`, the scheduler of a Dask cluster.",
     )
     job_deadline_s: float = Field(3600.0, gt=0, description="A job that runs longer is ended and marked failed.")
@@ -103,6 +103,12 @@ class Settings(BaseSettings):
         "",
         pattern="^(https?://.+)?$",
         description="Collector of OpenTelemetry traces, OTLP over HTTP; needs thermal-twin[traces]. Empty: no traces.",
+    )
+    metrics_port: int | None = Field(
+        None, ge=0, le=65535, description="Port at which `twin worker` serves /metrics; 0: a free one. Unset: nowhere."
+    )
+    metrics_host: str = Field(
+        "127.0.0.1", description="Address of those metrics, for which no key is needed: they show no telemetry."
     )
     log_level: str = Field("info", pattern="^(debug|info|warning|error)$", description="Least severe message logged.")
 

@@ -1,9 +1,14 @@
 """A worker: a process that does the jobs which service processes queue, and serves nobody."""
 
 import asyncio
+import contextlib
+import logging
 import signal
 from collections.abc import Callable
 from functools import partial
+from wsgiref.simple_server import WSGIServer
+
+from prometheus_client import start_http_server
 
 from service.monitoring.metrics import Metrics
 from service.running.start import running
@@ -11,6 +16,10 @@ from service.settings import Settings, SettingsError
 from service.store.database import Database
 from service.workbench.core import CoreWorkbench
 from service.workbench.interface import MakeWorkbench
+
+LOOK_S = 5.0
+"""So often a worker looks whether the database answers, for its metrics."""
+log = logging.getLogger("service")
 
 
 def work(
@@ -21,7 +30,7 @@ def work(
     Raises
     ------
     SettingsError, StoreError
-        If the database is a file, which one process has for itself, or cannot be used.
+        If the database is a file, which one process has for itself, or cannot be used; if the port of the metrics is taken.
     """
     if isinstance(settings.database, str):
         settings = settings.model_copy(update={"assimilate": False, "job_workers": max(settings.job_workers, 1)})
@@ -34,11 +43,33 @@ async def _work(settings: Settings, on_ready: Callable[[], None] | None, workben
     end = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, end.set)
-    database = Database(settings.database)
+    metrics = Metrics()
+    told = None if settings.metrics_port is None else _tell(metrics, settings.metrics_host, settings.metrics_port)
     try:
-        async with running(settings, database, Metrics(), workbench):
-            if on_ready is not None:
-                on_ready()
-            await end.wait()
+        database = Database(settings.database)
+        try:
+            async with running(settings, database, metrics, workbench):
+                if on_ready is not None:
+                    on_ready()
+                while not end.is_set():
+                    await metrics.look(database)
+                    with contextlib.suppress(TimeoutError):
+                        async with asyncio.timeout(LOOK_S):
+                            await end.wait()
+        finally:
+            database.close()
     finally:
-        database.close()
+        if told is not None:
+            await asyncio.to_thread(told.shutdown)
+            told.server_close()
+
+
+def _tell(metrics: Metrics, host: str, port: int) -> WSGIServer:
+    """Serve metrics at http://HOST:PORT/metrics."""
+    try:
+        server, _ = start_http_server(port, host, metrics.registry)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise SettingsError(f"TWIN_METRICS_HOST {host}, TWIN_METRICS_PORT {port}: {reason}; choose another") from error
+    log.info("metrics are served", extra={"url": f"http://{host}:{server.server_port}/metrics"})
+    return server

@@ -1,5 +1,6 @@
 """``twin close-loop``: from telemetry to a verdict, without a service."""
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,8 @@ def close_loop(
 ) -> None:
     """Calibrate, find what the model lacks, add it, and measure the error on telemetry kept back.
 
-    Exits with 0 whenever it reaches a verdict, also when the verdict is that no effect is supported.
+    Exits with 0 whenever it reaches a verdict, also when the verdict is that no effect is supported; of a fleet, if every
+    spacecraft does.
     """
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.fleet import close_fleet
@@ -94,11 +96,13 @@ def close_loop(
             raise click.UsageError(
                 "--fleet excludes --spec, --telemetry and --holdout-telemetry; each folder holds its own"
             )
-        if executor != "process" and not executor.startswith("dask://"):
+        if not re.fullmatch(r"process|dask://[^/]+:[0-9]+", executor):
             raise click.UsageError(f"--executor must be process or dask://HOST:PORT (got {executor})")
         options = {"holdout": 0.3 if holdout is None else holdout, "false_alarm_rate": false_alarm_rate}
         options |= {} if deadline is None else {"deadline_s": deadline}
-        _print_fleet(close_fleet(fleet, executor, out, options, masking=not no_masking), out, as_json)
+        reports = close_fleet(fleet, executor, out, options, masking=not no_masking)
+        _print_fleet(reports, out, as_json)
+        _refuse_failed(reports)
         return
     if spec_file is None or not telemetry:
         raise click.UsageError("give --spec and --telemetry, or --fleet")
@@ -176,6 +180,15 @@ def _save(loop: "ClosedLoop", out: Path) -> None:
     write_text(out / "model.json", to_json(loop.model.to_json()))
     write_text(out / "report.json", to_json(loop.report))
     write_text(out / "report.html", render(loop.report, loop.plots))
+
+
+def _refuse_failed(reports: dict[str, dict[str, Any]]) -> None:
+    """Say on stderr which spacecraft failed, and why; click.ClickException if one did."""
+    failed = {name: report["error"] for name, report in sorted(reports.items()) if "error" in report}
+    for name, error in failed.items():
+        click.echo(f"{name}: {' '.join(error.split())}", err=True)
+    if failed:
+        raise click.ClickException(f"{len(failed)} of {len(reports)} spacecraft failed: {', '.join(failed)}")
 
 
 def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -> None:

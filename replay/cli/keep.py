@@ -1,5 +1,6 @@
 """``twin backup``, ``twin restore`` and ``twin migrate``: whole copies of the service's database."""
 
+import re
 from pathlib import Path
 
 import click
@@ -83,16 +84,38 @@ def migrate_store(source: str, target: str, as_json: bool) -> None:
     The service must not run. FROM stays as it is. A password is best kept in PGPASSWORD or ~/.pgpass.
     """
     from replay.cli.console import print_line
-    from service.settings import read_settings
+    from service.settings import SettingsError, read_settings
     from service.store.transfer import transfer
 
-    origin, goal = (read_settings(host="127.0.0.1", database_url=url).database for url in (source, target))
-    moved = transfer(origin, goal)
+    places, names = [], [_named("FROM", source), _named("TO", target)]
+    for url, name in zip((source, target), names, strict=True):
+        try:
+            places.append(read_settings(host="127.0.0.1", database_url=url).database)
+        except SettingsError as error:
+            raise SettingsError(str(error).replace("TWIN_DATABASE_URL", name)) from None
+    moved = transfer(places[0], places[1], (names[0], names[1]))
     if not as_json:
         for one in moved:
             print_line(f"{one.table:18}{one.rows:>12,} rows  {one.sha256[:16]}")
     rows = sum(one.rows for one in moved)
     _say({"tables": [vars(one) for one in moved]}, f"{rows:,} rows, checksums agree", as_json)
+
+
+SHOWN = re.compile(
+    r"postgresql://(?:(?P<user>[\w.-]*)(?::[^@/?#]*)?@)?(?P<place>[\w.,-]*(?::\d+)?/[\w.-]*)(?:\?[^@]*)?"
+)
+"""A URL of which is sure what in it is the password: it is shown without that, and without what follows a question mark."""
+
+
+def _named(argument: str, url: str) -> str:
+    """Return what errors call a database: the argument, and as much of the URL as is surely no secret."""
+    if not url.startswith("postgresql:"):
+        return argument
+    found = SHOWN.fullmatch(url)
+    if found is None:
+        return argument
+    user = f"{found['user']}@" if found["user"] else ""
+    return f"{argument} postgresql://{user}{found['place']}"
 
 
 def _file(database: Path | None) -> Path:

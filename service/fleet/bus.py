@@ -15,10 +15,10 @@ from typing import Any
 
 import psycopg
 
-from service.fleet.ownership import BEAT_S, LEASE_S, Leases
+from service.fleet.ownership import BEAT_S, Leases
 from service.instants import keep_to
 from service.store import ownership
-from service.store.ownership import Changed
+from service.store.ownership import LEASE_S, Changed
 from service.store.postgres.engine import Speaking, connect
 
 log = logging.getLogger("service.fleet")
@@ -82,6 +82,7 @@ class Bus:
     def _attend(self, driver: "psycopg.Connection[Any]") -> None:
         """Take turns until the end, or until the connection fails."""
         connection = Speaking(driver)
+        ownership.attend(connection)
         beat_s = look_s = 0.0
         while not self._stop.is_set():
             if self._beat and time.monotonic() >= beat_s:

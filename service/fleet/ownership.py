@@ -6,12 +6,11 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from service.store import ownership
 from service.store.connection import Connection
-from service.store.ownership import Holding, slot_of
+from service.store.ownership import LEASE_S, Holding, slot_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
-LEASE_S = 5.0
 BEAT_S = 1.0
 
 
@@ -30,8 +29,11 @@ class Ownership(Protocol):
     def owns(self, twin: int) -> bool:
         """Return whether this process follows a twin now."""
 
-    def guard(self, twin: int) -> Guard:
-        """Return the right to write what follows from the samples of a twin that this process owns."""
+    def tenure(self, twin: int) -> int | None:
+        """Return the epoch in which this process follows a twin now; None if it does not."""
+
+    def guard(self, twin: int, tenure: int | None = None) -> Guard:
+        """Return the right to write what follows from the samples of a twin, in a tenure or else in the present one."""
 
     @property
     def leads(self) -> bool:
@@ -51,7 +53,11 @@ class Alone:
         """Return True."""
         return True
 
-    def guard(self, twin: int) -> Guard:
+    def tenure(self, twin: int) -> int:
+        """Return the only one there is."""
+        return 0
+
+    def guard(self, twin: int, tenure: int | None = None) -> Guard:
         """Return what lets everything pass."""
         return _unguarded  # type: ignore[return-value]
 
@@ -107,6 +113,10 @@ class Leases:
         """Return whether this process follows a twin now."""
         return slot_of(twin) in self.epochs
 
-    def guard(self, twin: int) -> Guard:
-        """Return the right to write for a twin during the present tenure; one that is not owned lets nothing pass."""
-        return _Fenced(twin, self._holding.epochs.get(slot_of(twin), -1))
+    def tenure(self, twin: int) -> int | None:
+        """Return the epoch in which this process follows a twin now; None if it does not."""
+        return self.epochs.get(slot_of(twin))
+
+    def guard(self, twin: int, tenure: int | None = None) -> Guard:
+        """Return the right to write for a twin in a tenure, or in the present one; one that is not owned lets nothing pass."""
+        return _Fenced(twin, self._holding.epochs.get(slot_of(twin), -1) if tenure is None else tenure)

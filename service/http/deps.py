@@ -72,8 +72,8 @@ TwinName = Annotated[str, Path(description="Id of a registered twin.")]
 
 
 async def named_twin(service: Running, twin: TwinName) -> Entry:
-    """Return the twin that the path names (404 if there is none)."""
-    return await service.find(twin)
+    """Return the twin that the path names as it is now, whichever process changed it last (404 if there is none)."""
+    return await service.find_now(twin)
 
 
 NamedTwin = Annotated[Entry, Depends(named_twin)]

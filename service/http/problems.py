@@ -21,6 +21,8 @@ from twin_core.errors import TwinError
 
 _LONG = re.compile(rf"[^\s']{{{LONGEST_NAME + 1},}}")
 MOST_ERRORS = 20
+RETRY_S = 1
+"""After so long it is worth asking again: a database that is away is looked for as often."""
 MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger("service")
 
@@ -98,8 +100,9 @@ TOLD = (Refusal, TwinError, TwinGone)
 def answer(error: Exception) -> Response:
     """Return the response for one of these errors."""
     if isinstance(error, Refusal):
-        headers = {"Retry-After": "1"} if isinstance(error, NotYet) else None
-        return problem(status_of(error), error.detail, error.errors, headers)
+        status = status_of(error)
+        headers = {"Retry-After": str(RETRY_S)} if status == 503 or isinstance(error, NotYet) else None
+        return problem(status, error.detail, error.errors, headers)
     if isinstance(error, TwinGone):
         return problem(404, "the twin was deleted meanwhile")
     assert isinstance(error, TwinError)

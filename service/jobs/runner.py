@@ -100,6 +100,7 @@ class Jobs:
         self._running: dict[str, _Running] = {}
         self._wake = asyncio.Event()
         self._is_closing = False
+        self._is_away = False
         self._tasks = [asyncio.create_task(self._claim_forever())] if workers else []
         self._tasks.append(asyncio.create_task(self._beat_forever()))
 
@@ -166,8 +167,11 @@ class Jobs:
             await self._free.acquire()
             held = None
             try:
+                await self._reach()
                 claiming = (self._name, round(1e6 * LEASE_S))
                 held = await self._database.write(jobs.claim, *claiming, is_shared=self._database.is_shared)
+            except ExecutorLost:
+                pass
             except Exception as error:  # such as a database that is away: the queue stays as it is
                 log.warning("no job can be claimed", extra={"reason": f"{type(error).__name__}: {error}"})
             if held is not None:
@@ -179,6 +183,19 @@ class Jobs:
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(LOOK_EVERY_S):
                     await self._wake.wait()
+
+    async def _reach(self) -> None:
+        """Return if what computes is there; otherwise say so once, and ExecutorLost."""
+        try:
+            await asyncio.to_thread(self._executor.reach)
+        except ExecutorLost as error:
+            if not self._is_away:
+                log.error("what computes is away; no job is taken until it is there", extra={"reason": str(error)})
+            self._is_away = True
+            raise
+        if self._is_away:
+            log.warning("what computes is there again")
+        self._is_away = False
 
     async def _beat_forever(self) -> None:
         """Say that this worker lives; let go of jobs that are in other hands, and end those that somebody cancelled."""

@@ -57,32 +57,40 @@ class Live:
         self._follows_elsewhere = database.is_shared
         self._thresholds = Thresholds(false_alarm_rate)
         self._trackers: dict[int, Tracker] = {}
+        self._tenures: dict[int, int] = {}
+        """Twin -> epoch that its tracker writes in."""
         self._pulses: dict[int, Pulse] = {}
         self.scores = Scores(database, self.engine)
         self._limits = LimitWatch(database, hub, self.engine, self.find, limit_horizon_s, ownership)
 
-    def add(self, twin: Entry) -> None:
-        """Begin to track a twin."""
-        if twin.key not in self._trackers:
+    def add(self, twin: Entry) -> bool:
+        """Begin to track a twin, if it is not tracked and this process owns it; return whether that began now."""
+        tenure = self._ownership.tenure(twin.key)
+        is_new = tenure is not None and twin.key not in self._trackers
+        if tenure is not None and is_new:
             rooms = (self._database, self._hub, self.engine, self._metrics)
-            guard = self._ownership.guard(twin.key)
+            guard = self._ownership.guard(twin.key, tenure)
             self._trackers[twin.key] = Tracker(twin, *rooms, self._thresholds, self._window, guard)
+            self._tenures[twin.key] = tenure
+        return is_new
+
+    def is_outlived(self, twin: Entry) -> bool:
+        """Return whether the tracker of a twin can write no more: the tenure in which it began is over."""
+        return twin.key in self._trackers and self._ownership.tenure(twin.key) != self._tenures[twin.key]
 
     async def let_go(self, twin: Entry) -> None:
         """Stop following a twin, which another process does now."""
         self._limits.forget(twin)
         tracker = self._trackers.pop(twin.key, None)
+        self._tenures.pop(twin.key, None)
         if tracker is not None:
             await tracker.close()
 
     async def remove(self, twin: Entry) -> None:
         """Stop tracking a twin."""
         self._pulses.pop(twin.key, None)
-        self._limits.forget(twin)
         self.scores.forget(twin)
-        tracker = self._trackers.pop(twin.key, None)
-        if tracker is not None:
-            await tracker.close()
+        await self.let_go(twin)
 
     def state(self, twin: Entry) -> Known:
         """Return what is known of the state of a twin; Refusal if nothing follows its samples.
@@ -90,11 +98,20 @@ class Live:
         Where another process follows them, that is what it has written down.
         """
         tracker = self._trackers.get(twin.key)
-        if tracker is None and self._follows_elsewhere and not self._ownership.owns(twin.key):
+        if tracker is None and self._follows_elsewhere:
             return Stored(twin, self._database)
         if tracker is None:
             raise Refusal(f"nothing follows the samples of '{twin.name}': TWIN_ASSIMILATE is off, or it was deleted")
         return tracker
+
+    async def seen(self, twin: Entry) -> Known | None:
+        """Return what is known of the state of a twin now, without waiting for it; None if nothing follows its samples."""
+        tracker = self._trackers.get(twin.key)
+        if not self._follows_elsewhere or (tracker is not None and tracker.active is not None):
+            return tracker
+        stored = Stored(twin, self._database)
+        await stored.look()
+        return stored
 
     async def beats(self, twin: Entry) -> dict[str, Beat]:
         """Return when each channel was last heard of, in their order."""

@@ -98,6 +98,7 @@ class Tracker:
         self._wake, self._idle = asyncio.Event(), asyncio.Event()
         self._wake.set()
         self._task = asyncio.create_task(self._run())
+        self._task.add_done_callback(lambda _: self._idle.set())  # nobody waits for what does not come
 
     @property
     def position(self) -> Position | None:
@@ -139,19 +140,22 @@ class Tracker:
         """Return whether everything stored when this was asked is assimilated, after waiting for it a while.
 
         The database is asked what that is: word of a model or of samples comes after their commit, from another process later
-        still, and whoever saw the commit may ask before it comes.
+        still, and whoever saw the commit may ask before it comes. A tracker that has ended, since another process follows the
+        twin now, assimilates nothing more.
         """
         seq, version = await self._database.read(progress.stands, self.twin.key)
         if version != (None if self.active is None else self.active.version):
             self.model_changed()
         elif seq > self._told_seq and self._scout is None:  # a scout hears of samples between two blocks of the archive
             self.arrived()
+        if self._task.done():
+            return False
         try:
             async with asyncio.timeout(timeout_s):
                 await self._idle.wait()
         except TimeoutError:
             return False
-        return True
+        return not self._task.done()
 
     async def close(self) -> None:
         """Stop."""

@@ -1,6 +1,7 @@
 """Prometheus metrics of one application, in a registry of its own so that applications do not share numbers."""
 
-from collections.abc import Iterable
+import asyncio
+from collections.abc import Iterable, Sequence
 
 from prometheus_client import (
     CollectorRegistry,
@@ -13,9 +14,19 @@ from prometheus_client import (
     generate_latest,
 )
 
+from service.store import fleet
+from service.store.connection import Connection
+from service.store.database import Database
 from service.store.fleet import Glance
 
+DATABASE_S = 3.0
+"""A scrape waits no longer for the database: Prometheus itself gives up after 10 s unless told otherwise."""
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+def _answers(connection: Connection) -> Sequence[Glance]:
+    connection.execute("SELECT 1").fetchone()
+    return ()
 
 
 class Metrics:
@@ -38,6 +49,7 @@ class Metrics:
             "twin_ingest_samples", "Samples by what became of them.", ("twin", "outcome"), registry=self.registry
         )
         self.backlog = Gauge("twin_store_backlog", "Operations that wait for the writer.", registry=self.registry)
+        self.database_up = Gauge("twin_database_up", "Whether the database answers: 1 or 0.", registry=self.registry)
         self.readers = Gauge("twin_stream_readers", "Open streams.", registry=self.registry)
         self.dropped = Counter("twin_stream_dropped", "Messages that slow readers missed.", registry=self.registry)
         self.jobs = Counter("twin_jobs", "Jobs that ended.", ("kind", "state"), registry=self.registry)
@@ -58,6 +70,20 @@ class Metrics:
         )
         for collector in (ProcessCollector, PlatformCollector, GCCollector):
             collector(registry=self.registry)
+
+    async def look(self, database: Database, *, at_twins: bool = False) -> None:
+        """Learn whether the database answers and, if wanted, how the twins are, which nobody knows while it does not."""
+        self.backlog.set(database.backlog)
+        seen: Sequence[Glance] = ()
+        try:
+            async with asyncio.timeout(DATABASE_S):
+                seen = await database.read(fleet.glances if at_twins else _answers)
+            self.database_up.set(1)
+        except Exception as error:
+            if not isinstance(error, TimeoutError) and not database.is_fault(error):
+                raise
+            self.database_up.set(0)
+        self.show(seen)
 
     def show(self, twins: Iterable[Glance]) -> None:
         """Show the twins as they are now, and no longer those that are gone."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from service.fleet.ownership import Leases
 from service.store.errors import Missing, TwinGone
-from service.store.ownership import Changed, slot_of
+from service.store.ownership import Changed
 from service.twins.registry import Entry
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ class Member:
         self._loop = asyncio.get_running_loop()
         self._known: dict[int, Changed] = {}
         self._entries: dict[int, Entry] = {}
-        self._tenures: dict[int, int] = {}
-        """Twin -> epoch with which this process follows it."""
         self._heard: asyncio.Queue[tuple[Sequence[Changed], bool]] = asyncio.Queue()
         self._joined = asyncio.Event()
         self._task = asyncio.create_task(self._run())
@@ -75,26 +73,26 @@ class Member:
                     await self._apply(one)
                 if whole:
                     await self._drop_all_but({one.twin for one in changed})
-                    await self._follow_own()
+                    await self._service.follow_own()
                     self._joined.set()
             except Exception:
                 log.exception("changes of other processes could not be taken over")
 
     async def _apply(self, one: Changed) -> None:
         before = self._known.get(one.twin)
-        if before == one:
+        if before == one or one.twin in self._service.leaving:  # who deletes it may wait for its jobs, for long
             return
         service = self._service
         try:
             entry = await service.find(one.name)
-            if entry.revision < one.revision:
-                await self._let_go(entry)
-                await service.renew_twin(entry)
-                entry = await service.find(one.name)
+            if entry.key != one.twin or entry.revision < one.revision:
+                entry = await service.find_now(one.name)
         except (Missing, TwinGone):
             return
+        if entry.key != one.twin:  # another one stands in its place by now, which is told of, too
+            return
         self._known[one.twin], self._entries[one.twin] = one, entry
-        self._follow(entry)
+        service.follow(entry)
         if one.seq > service.hub.head(one.twin):
             service.hub.advance(one.twin, one.seq)
             service.live.arrived(entry)
@@ -106,24 +104,4 @@ class Member:
     async def _drop_all_but(self, there: set[int]) -> None:
         for twin in self._known.keys() - there:
             del self._known[twin]
-            self._tenures.pop(twin, None)
             await self._service.forget_twin(self._entries.pop(twin))
-
-    async def _follow_own(self) -> None:
-        """Begin to follow what this process owns now, and let go of what it does not."""
-        epochs = self._leases.epochs
-        for twin, entry in self._entries.items():
-            if twin in self._tenures and epochs.get(slot_of(twin)) != self._tenures[twin]:
-                await self._let_go(entry)
-            self._follow(entry)
-
-    def _follow(self, entry: Entry) -> None:
-        epoch = self._leases.epochs.get(slot_of(entry.key))
-        if epoch is not None and entry.key not in self._tenures and self._service.settings.assimilate:
-            self._tenures[entry.key] = epoch
-            self._service.live.add(entry)
-            self._service.live.arrived(entry)
-
-    async def _let_go(self, entry: Entry) -> None:
-        self._tenures.pop(entry.key, None)
-        await self._service.live.let_go(entry)

@@ -16,7 +16,7 @@ from service.running.dispatch import Dispatch
 from service.running.housekeeping import Housekeeping
 from service.running.member import Member, join
 from service.running.service import Service
-from service.settings import Settings
+from service.settings import Settings, SettingsError
 from service.store import jobs as job_table
 from service.store import twins as twin_table
 from service.store.database import Database
@@ -98,6 +98,9 @@ def _executor(settings: Settings) -> Tasks:
     workers = max(settings.job_workers, 1)
     if settings.executor == "process":
         return ProcessPerTask(workers, settings.job_deadline_s, settings.job_memory_mib)
-    from service.jobs.dask import DaskTasks
+    try:
+        from service.jobs.dask import DaskTasks
+    except ModuleNotFoundError as error:
+        raise SettingsError("TWIN_EXECUTOR: dask:// needs Dask: pip install 'thermal-twin[dask]'") from error
 
     return DaskTasks(settings.executor.replace("dask://", "tcp://"), workers, settings.job_deadline_s)

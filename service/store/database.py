@@ -39,15 +39,18 @@ class _Order:
     error: BaseException | None = None
 
 
-def open_engine(place: Path | str) -> Engine:
-    """Open a database: a SQLite file, or a server by its URL (``postgresql://…``); StoreError if that is impossible."""
+def open_engine(place: Path | str, name: str = "TWIN_DATABASE_URL") -> Engine:
+    """Open a database: a SQLite file, or a server by its URL (``postgresql://…``); StoreError if that is impossible.
+
+    ``name`` is what errors call the setting or the argument that named it.
+    """
     if isinstance(place, str):
         from service.store.postgres.engine import PostgresEngine
 
-        return PostgresEngine(place)
+        return PostgresEngine(place, name)
     from service.store.sqlite.engine import SqliteEngine
 
-    return SqliteEngine(place)
+    return SqliteEngine(place, name)
 
 
 class Database:

@@ -58,6 +58,9 @@ class Engine(Protocol):
     def refusal(self, error: Exception) -> Exception:
         """Return what the caller is told about a fault."""
 
+    def is_attended(self, connection: Connection) -> bool:
+        """Return whether a service or a worker is at work on the database."""
+
     def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
         """Go on counting behind what was copied: table -> the column whose numbers the database hands out."""
 

@@ -16,6 +16,12 @@ SPREAD = 159
 slots (multiplicative hashing, D. E. Knuth, The Art of Computer Programming 3, section 6.4)."""
 
 
+LEASE_S = 5.0
+"""So long after its last word a process is taken for dead."""
+ATTENDING = 28_871
+"""First key of the advisory lock that every process at work on a database shares; the second one stands for the schema."""
+
+
 def slot_of(twin: int) -> int:
     """Return the slot of a twin."""
     return twin * SPREAD % SLOTS
@@ -61,6 +67,19 @@ def renew(connection: Connection, name: str, lease_us: int) -> Holding:
     elif len(epochs) < share:
         epochs |= _take(connection, name, share - len(epochs), lease_us)
     return Holding(epochs, members, clock_us)
+
+
+def attend(connection: Connection) -> None:
+    """Let others see, for as long as the connection lives, that a process is at work on the database."""
+    connection.execute("SELECT pg_advisory_lock_shared(?, hashtext(current_schema()))", (ATTENDING,))
+
+
+def is_attended(connection: Connection) -> bool:
+    """Return whether a service or a worker is at work on the database; if none is, none begins before the transaction ends."""
+    query = "SELECT count(*) FROM member WHERE beat_us > clock_us() - ?"
+    members = connection.execute(query, (round(1e6 * LEASE_S),)).fetchone()[0]
+    query = "SELECT pg_try_advisory_xact_lock(?, hashtext(current_schema()))"
+    return members > 0 or not connection.execute(query, (ATTENDING,)).fetchone()[0]
 
 
 def _take(connection: Connection, name: str, most: int, lease_us: int) -> dict[int, int]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from service.errors import Refusal
 from service.store.connection import Connection
 from service.store.database import open_engine
 from service.store.engine import Engine
@@ -75,43 +76,57 @@ class Moved:
     sha256: str
 
 
-def transfer(source: Path | str, target: Path | str) -> list[Moved]:
+def transfer(
+    source: Path | str, target: Path | str, names: tuple[str, str] = ("the source", "the target")
+) -> list[Moved]:
     """Copy everything in one transaction, read it back and compare digests; the source stays as it is.
 
     Parameters
     ----------
     source, target
-        Files of SQLite or URLs of PostgreSQL; no service may write to the source meanwhile.
+        Files of SQLite or URLs of PostgreSQL.
+    names
+        What errors call the two.
 
     Raises
     ------
     StoreError
-        If a database cannot be opened, the target is not empty, or what was written is not what was read.
+        If a database cannot be opened or used, or a service or a worker is at work on it; if the target is not empty, or
+        what was written is not what was read.
     """
     if isinstance(source, Path) and not source.is_file():
         raise StoreError(f"{source}: there is no such file")
-    origin = open_engine(source)
+    origin = open_engine(source, names[0])
     try:
-        goal = open_engine(target)
+        goal = open_engine(target, names[1])
         try:
-            return origin.read(lambda connection: _copy(connection, goal))
+            return origin.read(lambda connection: _copy(connection, origin, goal, names))
+        except Exception as error:
+            if not isinstance(error, (*origin.faults, *goal.faults, Refusal)):
+                raise
+            told = goal.refusal(error)
+            reason = told.detail if isinstance(told, Refusal) else type(told).__name__
+            raise StoreError(f"the copy was interrupted, nothing was kept: {reason}") from error
         finally:
             goal.close()
     finally:
         origin.close()
 
 
-def _copy(origin: Connection, goal: Engine) -> list[Moved]:
+def _copy(connection: Connection, origin: Engine, goal: Engine, names: tuple[str, str]) -> list[Moved]:
     session = goal.session()
     try:
         session.begin(())
+        for engine, end, name in ((origin, connection, names[0]), (goal, session.connection, names[1])):
+            if engine.is_attended(end):
+                raise StoreError(f"{name}: a service or a worker is at work on it; stop all of them first")
         for table in TABLES:
             if session.connection.execute(f"SELECT 1 FROM {table} LIMIT 1").fetchone() is not None:
-                raise StoreError("the target is not empty; name a database that holds nothing yet")
+                raise StoreError(f"{names[1]}: is not empty; name a database that holds nothing yet")
         made = []
         for table in TABLES:
             read = _Digest()
-            for page in read.pages(origin, table):
+            for page in read.pages(connection, table):
                 if table == "chunk":
                     make_room(session.connection, [row[3] for row in page])
                 _insert(session.connection, table, page)

@@ -118,6 +118,14 @@ def get(connection: Connection, name: str) -> Twin:
     return Twin(*row)
 
 
+def mark(connection: Connection, name: str) -> tuple[int, int]:
+    """Return the number and the revision of a twin, which tell whether what is known of it still holds; Missing if it is gone."""
+    row = connection.execute("SELECT id, revision FROM twin WHERE name = ?", (name,)).fetchone()
+    if row is None:
+        raise Missing(f"no twin '{name}' is registered")
+    return int(row[0]), int(row[1])
+
+
 def select(connection: Connection) -> list[Twin]:
     """Return every twin, by name."""
     return [Twin(*row) for row in connection.execute(_SELECT + "ORDER BY twin.name")]

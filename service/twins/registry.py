@@ -107,6 +107,10 @@ class Registry:
         """Forget a twin."""
         self._entries.pop(name, None)
 
+    def find(self, name: str) -> Entry | None:
+        """Return one twin, None if there is none of that name."""
+        return self._entries.get(name)
+
     def get(self, name: str) -> Entry:
         """Return one twin; Missing if there is none of that name."""
         try:

@@ -4,7 +4,7 @@ from fastapi import APIRouter, Response
 
 from service.http.deps import Running, reads
 from service.monitoring.metrics import CONTENT_TYPE
-from service.store import fleet, twins
+from service.store import twins
 
 router = APIRouter(tags=["health"])
 
@@ -24,7 +24,6 @@ async def ready(service: Running) -> dict[str, str]:
 
 @router.get("/metrics", dependencies=[reads])
 async def metrics(service: Running) -> Response:
-    """Return the metrics in the text format of Prometheus."""
-    service.metrics.backlog.set(service.database.backlog)
-    service.metrics.show(await service.database.read(fleet.glances))
+    """Return the metrics in the text format of Prometheus; without those of twins while the database does not answer."""
+    await service.metrics.look(service.database, at_twins=True)
     return Response(service.metrics.render(), media_type=CONTENT_TYPE)

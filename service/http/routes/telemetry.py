@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Callable
 from typing import Annotated, Any
 
 import numpy as np
@@ -15,12 +16,14 @@ from service.archive.downsample import extremes
 from service.errors import BadField, short
 from service.http.deps import NamedTwin, Running, Service, TwinName, operates, reads, refuse_unknown, require
 from service.http.problems import Problem
-from service.http.telemetry_body import parse_columns, parse_frames
+from service.http.telemetry_body import Units, parse_columns, parse_frames
 from service.instants import format_instant, format_instants, parse_instant, parse_parameter
 from service.keys import Role
 from service.schemas import Archive, Deletion, DeletionList, IngestReport, Interval, Posted, Quarantine
 from service.store import aside, samples
 from service.store.appending import Receipt
+from service.store.batch import Batch
+from service.store.errors import TwinGone
 from service.store.merge import ACCEPTED, CONFLICT, DUPLICATE, QUARANTINED
 from service.store.samples import Samples
 from service.twins.registry import Entry
@@ -65,6 +68,19 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     entry = await service.find(twin)
     body = (await request.receive()).get("body", b"")  # whole: see Bodies
     parse = _parser(request.headers.get("content-type", ""))
+    try:
+        return await _take(service, entry, body, parse)
+    except (BadField, TwinGone):
+        now = await service.find_now(twin)
+        if now is entry:
+            raise
+    return await _take(
+        service, now, body, parse
+    )  # another process has given it channels, or put it in place of another one
+
+
+async def _take(service: Service, entry: Entry, body: bytes, parse: Callable[[bytes, Units], Batch]) -> Response:
+    """Store what a body holds, all of it or nothing, and answer what became of each sample."""
     if len(body) > PARSE_APART_BYTES:
         batch = await asyncio.to_thread(parse, body, entry.units)
     else:
@@ -78,7 +94,7 @@ async def ingest(request: Request, twin: TwinName) -> Response:
 """The route of ``ingest``, for a way past the framework."""
 
 
-def _parser(content_type: str) -> Any:
+def _parser(content_type: str) -> Callable[[bytes, Units], Batch]:
     media = content_type.partition(";")[0].strip().lower()
     if media == "application/json":
         return parse_columns

@@ -57,7 +57,8 @@ def _info(twin: Twin) -> dict[str, Any]:
 
 
 async def _detail(service: Service, twin: Twin) -> TwinDetail:
-    tracker = service.live.find(twin.key)
+    entry = service.registry.get(twin.name)
+    tracker = await service.live.seen(entry)
     catching_up = tracker is not None and tracker.catching_up
     progress = None
     if tracker is not None and tracker.active is not None:
@@ -65,7 +66,6 @@ async def _detail(service: Service, twin: Twin) -> TwinDetail:
         state_us = None if tracker.position is None else tracker.position.time_us
         since = _when(tracker.floor_us)
         progress = Assimilation(done=lag.done, of=lag.of, state_time=_when(state_us), behind_s=lag.seconds, since=since)
-    entry = service.registry.get(twin.name)
     return TwinDetail(
         **_info(twin),
         catching_up=catching_up,

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg import errors
 
-from service.store import segments
+from service.store import ownership, segments
 from service.store.connection import Connection, Cursor
 from service.store.errors import DiskFull, StoreError, Unavailable
 from service.store.postgres import partitions
@@ -175,26 +175,26 @@ class PostgresEngine:
     is_shared = True
     chores: tuple[tuple[str, Callable[[Connection], int]], ...] = ()
 
-    def __init__(self, url: str) -> None:
-        """Connect and migrate; StoreError if that is impossible."""
-        self.url = url
+    def __init__(self, url: str, name: str) -> None:
+        """Connect and migrate; StoreError if that is impossible, with the ``name`` under which the URL was given."""
+        self.url, self._name = url, name
         self._local = threading.local()
         self._opened: list[psycopg.Connection[Any]] = []
         try:
             with connect(url) as driver:
                 migrate(Speaking(driver))
         except Unavailable as error:
-            raise StoreError(f"TWIN_DATABASE_URL: {error.detail}") from None
+            raise StoreError(f"{name}: {error.detail}") from None
         except psycopg.Error as error:
             said = _without_secrets(error, url)
-            raise StoreError(f"TWIN_DATABASE_URL: the database cannot be used ({said})") from None
+            raise StoreError(f"{name}: the database cannot be used ({said})") from None
 
     def session(self) -> PostgresSession:
         """Return the session that writes."""
         try:
             return PostgresSession(self.url)
         except Unavailable as error:
-            raise StoreError(f"TWIN_DATABASE_URL: {error.detail}") from None
+            raise StoreError(f"{self._name}: {error.detail}") from None
 
     def read(self, operation: Callable[[Connection], T]) -> T:
         """Run an operation on a snapshot; once more if the connection turns out to be dead."""
@@ -239,6 +239,10 @@ class PostgresEngine:
             log.error("the database does not answer", extra={"reason": _without_secrets(error, self.url)})
             return Unavailable("the database cannot be reached; send it again: what is stored already is recognised")
         return error
+
+    def is_attended(self, connection: Connection) -> bool:
+        """Return whether a service or a worker is at work on the database."""
+        return ownership.is_attended(connection)
 
     def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
         """Let each sequence go on behind the rows that were copied."""

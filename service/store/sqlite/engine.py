@@ -67,17 +67,17 @@ class SqliteEngine:
     is_shared = False
     chores: tuple[tuple[str, Callable[[Connection], int]], ...] = (("free pages", vacuum),)
 
-    def __init__(self, path: Path) -> None:
-        """Lock, open and migrate the file; StoreError if that is impossible."""
+    def __init__(self, path: Path, name: str = "TWIN_DATABASE_URL") -> None:
+        """Lock, open and migrate the file; StoreError if that is impossible, with the ``name`` under which it was given."""
         self._path = path
-        self._lock = FileLock(path)
+        self._lock = FileLock(path, name)
         self._local = threading.local()
         self._opened: list[sqlite3.Connection] = []
         try:
             self._writer = _open(path)
         except sqlite3.Error as error:
             self._lock.release()
-            raise StoreError(f"{path}: cannot be used as a database ({error}); check TWIN_DATABASE_URL") from error
+            raise StoreError(f"{path}: cannot be used as a database ({error}); check {name}") from error
 
     def session(self) -> SqliteSession:
         """Return the session that writes."""
@@ -107,6 +107,10 @@ class SqliteEngine:
             log.error("the disk is full; nothing of the write was stored", extra={"sqlite": name})
             return DiskFull("the disk is full: nothing of this request was stored; free some space and send it again")
         return error
+
+    def is_attended(self, connection: Connection) -> bool:
+        """Return False: whoever opens the file has it for itself."""
+        return False
 
     def after_transfer(self, connection: Connection, keys: Mapping[str, str]) -> None:
         """Do nothing: SQLite looks at the rows itself."""

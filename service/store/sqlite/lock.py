@@ -17,9 +17,9 @@ class FileLock:
     holds when another link leads to it.
     """
 
-    def __init__(self, database: Path) -> None:
-        """Take the locks; StoreError if another server holds one of them."""
-        self._database = database
+    def __init__(self, database: Path, name: str = "TWIN_DATABASE_URL") -> None:
+        """Take the locks; StoreError if another server holds one of them. ``name`` is that of what named the file."""
+        self._database, self._name = database, name
         place = database.resolve()
         self._place = self._lock(place.with_name(place.name + ".lock"), 0o600)
         try:
@@ -42,7 +42,7 @@ class FileLock:
         try:
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, mode)
         except OSError as error:
-            reason = f"cannot be opened ({error.strerror}); check TWIN_DATABASE_URL"
+            reason = f"cannot be opened ({error.strerror}); check {self._name}"
             raise StoreError(f"{self._database}: {reason}") from error
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -10,11 +10,11 @@ import sys
 class Cluster:
     """A scheduler and a worker, each a process that a test may kill."""
 
-    def __init__(self) -> None:
-        """Start both."""
+    def __init__(self, port: int | None = None) -> None:
+        """Start both, at a free port unless one is named."""
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            self._port = free.getsockname()[1]
+            self._port = port or free.getsockname()[1]
         self.address = f"tcp://127.0.0.1:{self._port}"
         self.scheduler = self.add_scheduler()
         self.worker = self.add_worker()

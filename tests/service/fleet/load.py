@@ -39,6 +39,12 @@ WITNESS = f"""
     CREATE TRIGGER witness AFTER INSERT OR UPDATE ON checkpoint FOR EACH ROW EXECUTE FUNCTION witness();
 """
 """The database notes by itself which connection writes the live state of a twin in which epoch."""
+WORKER = FAKE.replace("service.server import serve", "service.worker import work").replace(
+    "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)",
+    "work(read_settings(), lambda: print('listening on', 'nothing', flush=True), FakeWorkbench)",
+)
+"""A process that does jobs and serves nobody."""
+LOGGED = "from service.monitoring.logs import start_logging; start_logging('info');"
 SKEWED = "import time; real = time.time_ns; time.time_ns = lambda: real() + {skew_s} * 10**9;" + FAKE
 STARTED: list["Load"] = []
 """What may still be sending: a test that fails leaves its load behind."""
@@ -87,9 +93,9 @@ def fleet(
 class Load:
     """Sends samples of every twin to whichever service answers, each again until it is acknowledged."""
 
-    def __init__(self, urls: Callable[[], list[str]], count: int) -> None:
-        """Begin to send to the services that there are at a time."""
-        self._urls, self._stop = urls, threading.Event()
+    def __init__(self, urls: Callable[[], list[str]], count: int, begin_s: int = BEGIN_S) -> None:
+        """Begin to send to the services that there are at a time: samples of the seconds from ``begin_s`` on, up to now."""
+        self._urls, self._stop, self.begin_s = urls, threading.Event(), begin_s
         self.sent = {name: 0 for name in names(count)}
         self.refused = 0
         self.wrong: list[str] = []
@@ -129,13 +135,14 @@ class Load:
         with httpx.Client(timeout=10.0, trust_env=False, headers={"Authorization": f"Bearer {KEY}"}) as client:
             while not self._stop.is_set():
                 for name in own:
-                    turn += 1
-                    self._deliver(client, name, turn)
+                    if self.begin_s + self.sent[name] + 1 < time.time():
+                        turn += 1
+                        self._deliver(client, name, turn)
                 time.sleep(0.05)
 
     def _deliver(self, client: httpx.Client, name: str, turn: int) -> None:
         first = self.sent[name]
-        body = {"time": [BEGIN_S + first + k for k in range(2)], "values": _values(name, first, 2)}
+        body = {"time": [self.begin_s + first + k for k in range(2)], "values": _values(name, first, 2)}
         while True:
             urls = self._urls()
             try:
@@ -207,7 +214,7 @@ def tally(url: str, load: Load, wait_s: float = 60.0) -> Tally:
             raw = database.engine.read(lambda c, key=key: samples.since_seq(c, key, 3, 0)[0])  # type: ignore[misc]
             query = f"SELECT seq FROM event WHERE twin = {key}"
             told = database.engine.read(lambda c, query=query: [row[0] for row in c.execute(query)])  # type: ignore[misc]
-            instants = (BEGIN_S + np.arange(sent + 2)) * 10**6  # the last one may be stored and its answer lost
+            instants = (load.begin_s + np.arange(sent + 2)) * 10**6  # the last one may be stored and its answer lost
             lost += int((~np.isin(instants[:sent], archive.time_us)).sum())
             twice += raw.size - archive.time_us.size
             twice += (

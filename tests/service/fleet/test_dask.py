@@ -1,6 +1,7 @@
 """Tasks on a Dask cluster whose worker, and then whose scheduler, is killed."""
 
 import os
+import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,8 @@ from service.jobs.dask import DaskTasks
 from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Task
 from tests.service.fakes import GATE
 from tests.service.fleet.cluster import Cluster
-from tests.service.fleet.load import assert_jobs_done_once, calibrations, fleet, prepare
+from tests.service.fleet.load import LOGGED, WORKER, assert_jobs_done_once, calibrations, fleet, prepare
+from tests.service.server import FAKE
 from twin_core.errors import ModelError
 
 pytestmark = [pytest.mark.fleet, pytest.mark.filterwarnings("ignore")]
@@ -110,3 +112,37 @@ def test_jobs_of_a_service_survive_worker_and_scheduler(
     finally:
         cluster.kill(cluster.worker)
         cluster.kill(cluster.scheduler)
+
+
+def test_a_scheduler_that_is_not_there_is_told_once_and_jobs_wait(
+    tmp_path: Path, postgres: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = tmp_path / "gate"
+    gate.touch()
+    monkeypatch.setenv(GATE, str(gate))
+    prepare(postgres, 1)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    own = {"executor": f"dask://127.0.0.1:{port}", "log_level": "info", "job_workers": "0"}
+    with fleet(tmp_path, [postgres] * 2, [FAKE, LOGGED + WORKER], **own) as (service, worker):
+        jobs = calibrations(service, 2)
+
+        def told(what: str) -> list[str]:
+            return [line for line in worker.log().splitlines() if what in line]
+
+        end_s = time.monotonic() + 60.0
+        while not told("what computes is away"):
+            assert time.monotonic() < end_s
+            time.sleep(0.1)
+        time.sleep(5)  # several looks later
+        assert len(told("what computes is away")) == 1 and str(port) in told("what computes is away")[0]
+        with psycopg.connect(postgres, autocommit=True) as connection:
+            assert connection.execute("SELECT DISTINCT state FROM job").fetchall() == [("queued",)]
+        cluster = Cluster(port)
+        try:
+            assert_jobs_done_once(postgres, jobs, "no Dask scheduler at first", 180.0)
+            assert len(told("what computes is there again")) == 1
+        finally:
+            cluster.kill(cluster.worker)
+            cluster.kill(cluster.scheduler)

@@ -15,10 +15,12 @@ from urllib.parse import urlsplit
 import psycopg
 import pytest
 
+from service.settings import Settings
 from tests.service.fakes import GATE
 from tests.service.fleet.load import (
     KEY,
     SKEWED,
+    WORKER,
     Load,
     assert_jobs_done_once,
     assert_nothing_lost,
@@ -32,6 +34,10 @@ from tests.service.server import FAKE, Server
 
 pytestmark = pytest.mark.fleet
 TWINS = 8
+LATE_S, PAST_S = 420, 200
+"""A clock that shows the present so much later, and the past that a load begins with: LATE_S - TOLERANCE_S < PAST_S."""
+TOLERANCE_S = Settings.model_fields["clock_tolerance_s"].default
+"""The default: samples further ahead of the clock go into quarantine."""
 
 
 def test_a_loss_would_be_noticed(tmp_path: Path, postgres: str) -> None:
@@ -228,19 +234,29 @@ def test_the_network_is_cut(tmp_path: Path, postgres: str) -> None:
 
 
 def test_clocks_differ_by_minutes(tmp_path: Path, postgres: str) -> None:
+    """Quarantine is on: samples of the present lie further ahead of the clock of one process than it tolerates.
+
+    Other samples of these twins lie behind it, and those before were of the present when another process received them: what
+    lies ahead is no clock of its own, and would go into quarantine. The process that is late is killed, too.
+    """
     prepare(postgres, TWINS)
-    with fleet(tmp_path, [postgres] * 2, [SKEWED.format(skew_s=-300), SKEWED.format(skew_s=420)]) as (one, other):
-        alive = [one.url, other.url]
-        load = Load(lambda: list(alive), TWINS)
-        load.until(lambda: load.acknowledged > 4 * TWINS)
-        time.sleep(4)
-        one.kill()
-        alive.remove(one.url)
+    commands = [SKEWED.format(skew_s=skew_s) for skew_s in (-LATE_S, 120)]
+    with fleet(tmp_path, [postgres] * 2, commands, clock_tolerance_s=str(TOLERANCE_S)) as (late, early):
+        alive = [early.url]
+        load = Load(lambda: list(alive), TWINS, int(time.time()) - PAST_S)
+        load.until(lambda: min(load.sent.values()) > PAST_S)  # all twins are live: they go on by the clock
+        alive.append(late.url)
+        before = load.acknowledged
+        load.until(lambda: load.acknowledged > before + 8 * TWINS)
+        late.kill()
+        alive.remove(late.url)
         before = load.acknowledged
         time.sleep(10)
         load.until(lambda: load.acknowledged > before + TWINS)  # by the other one
         load.end()
-        assert_nothing_lost(postgres, load, "clocks 12 min apart, SIGKILL of an owner")
+        assert_nothing_lost(postgres, load, "clocks 9 min apart, SIGKILL of an owner")
+    with psycopg.connect(postgres) as connection:
+        assert connection.execute("SELECT count(*) FROM aside").fetchone() == (0,)
 
 
 def test_failover_to_a_promoted_standby(tmp_path: Path) -> None:
@@ -329,11 +345,7 @@ def test_a_worker_is_killed(tmp_path: Path, postgres: str, monkeypatch: pytest.M
     prepare(postgres, 1)
     gate = tmp_path / "gate"
     monkeypatch.setenv(GATE, str(gate))
-    worker = FAKE.replace("service.server import serve", "service.worker import work").replace(
-        "serve(read_settings(), lambda url: print('listening on', url, flush=True), FakeWorkbench)",
-        "work(read_settings(), lambda: print('listening on', 'nothing', flush=True), FakeWorkbench)",
-    )
-    with fleet(tmp_path, [postgres] * 3, [FAKE, worker, worker]) as (service, *workers):
+    with fleet(tmp_path, [postgres] * 3, [FAKE, WORKER, WORKER]) as (service, *workers):
         jobs = calibrations(service, 3)
 
         def held() -> dict[str, str]:

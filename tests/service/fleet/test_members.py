@@ -6,7 +6,10 @@ from typing import Any
 
 import pytest
 
-from service.store.ownership import slot_of
+from service.fleet.ownership import Leases
+from service.running.member import Member
+from service.store import twins
+from service.store.ownership import SLOTS, Changed, Holding, slot_of
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
@@ -90,3 +93,127 @@ def test_what_one_changes_the_others_know(pair: tuple[AppClient, AppClient]) -> 
     assert one.delete(TWIN).status_code == 204
     until(lambda: other.get(TWIN).status_code == 404)
     assert other.post(f"{TWIN}/telemetry", json=body).status_code == 404
+
+
+WIDER = {**SPEC, "channels": {**SPEC["channels"], "extra": {"kind": "auxiliary", "unit": "deg"}}}
+
+
+@pytest.fixture
+def deaf(pair: tuple[AppClient, AppClient], monkeypatch: pytest.MonkeyPatch) -> tuple[AppClient, AppClient]:
+    """Two members; the second one hears nothing of what the first one changes, neither by a hint nor by a look."""
+    applied, second = Member._apply, pair[1].app.state.service
+
+    async def apply(self: Member, one: Changed) -> None:
+        if self._service is not second:
+            await applied(self, one)
+
+    monkeypatch.setattr(Member, "_apply", apply)
+    return pair
+
+
+def test_a_channel_that_came_elsewhere_is_taken_at_once(deaf: tuple[AppClient, AppClient]) -> None:
+    one, other = deaf
+    one.post("/v1/twins", json=SPEC)
+    assert other.get(TWIN).status_code == 200
+    assert one.request("PUT", TWIN, json=WIDER).status_code == 200
+    answer = other.post(f"{TWIN}/telemetry", json={"time": [5], "values": {"extra": [1.0]}})
+    assert answer.status_code == 200, answer.text
+    refused = other.post(f"{TWIN}/telemetry", json={"time": [5], "values": {"another": [1.0]}})
+    assert refused.status_code == 422 and "unknown channel 'another'" in refused.json()["detail"]
+
+
+def test_a_channel_that_came_elsewhere_can_be_asked_for_at_once(deaf: tuple[AppClient, AppClient]) -> None:
+    one, other = deaf
+    one.post("/v1/twins", json=SPEC)
+    assert other.get(TWIN).status_code == 200
+    assert one.request("PUT", TWIN, json=WIDER).status_code == 200
+    one.post(f"{TWIN}/telemetry", json={"time": [5], "values": {"extra": [1.0]}})
+    answer = other.get(f"{TWIN}/telemetry?channels=extra")
+    assert answer.status_code == 200 and answer.json()["values"] == {"extra": [1.0]}
+
+
+@pytest.mark.parametrize("first", ["GET", "PUT", "POST"])
+def test_a_twin_registered_anew_elsewhere_is_there_at_once(deaf: tuple[AppClient, AppClient], first: str) -> None:
+    one, other = deaf
+    one.post("/v1/twins", json=SPEC)
+    assert other.get(TWIN).status_code == 200
+    assert one.delete(TWIN).status_code == 204
+    assert one.post("/v1/twins", json=WIDER).status_code == 201
+    if first == "GET":
+        assert other.get(TWIN).json()["channels"] == list(WIDER["channels"])
+    elif first == "PUT":
+        assert other.request("PUT", TWIN, json=WIDER).status_code == 200
+    assert feed(other, 0)["accepted"] == 60
+    assert other.get(TWIN).json()["samples"] == 60
+    assert one.delete(TWIN).status_code == 204
+    assert other.get(TWIN).status_code == 404
+
+
+def test_a_twin_registered_anew_elsewhere_is_followed_by_its_owner(pair: tuple[AppClient, AppClient]) -> None:
+    one, other = pair
+    for _ in range(6):  # numbers that belong to either of them
+        one.post("/v1/twins", json=SPEC)
+        until(lambda: other.get(TWIN).status_code == 200)
+        assert one.delete(TWIN).status_code == 204
+        assert one.post("/v1/twins", json=SPEC).status_code == 201
+        key = one.app.state.service.registry.get("benchsat").key
+        until(lambda key=key: any(c.app.state.service.live.find(key) is not None for c in pair))  # type: ignore[misc]
+        assert other.delete(TWIN).status_code == 204
+
+
+def activate(client: AppClient) -> None:
+    model = {"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0}
+    assert client.post(f"{TWIN}/models", json=model).status_code == 201
+    assert client.post(f"{TWIN}/models/1/activate").status_code == 200
+
+
+def test_every_process_says_how_far_the_owner_is(pair: tuple[AppClient, AppClient]) -> None:
+    one, other = pair
+    one.post("/v1/twins", json=SPEC)
+    assert one.get(TWIN).json()["assimilation"] is None and other.get(TWIN).json()["assimilation"] is None
+    feed(one, 0)
+    activate(one)
+
+    def told() -> list[Any]:
+        return [(d["assimilation"], d["catching_up"]) for d in (c.get(TWIN).json() for c in pair)]
+
+    done = {"done": 60, "of": 60, "state_time": "1970-01-01T00:00:59Z", "behind_s": 0.0, "since": None}
+    until(lambda: told() == [(done, False)] * 2, 90.0)  # a worker process starts first
+    one.post(f"{TWIN}/telemetry", json={"time": [100_000], "values": {"T_px": [290.0]}})  # a lone one waits for company
+    done |= {"done": 61, "of": 61}
+    until(lambda: told() == [(done, False)] * 2)
+
+
+def test_a_process_that_follows_nothing_says_what_is_left(
+    database_url: str, make_client: Callable[..., AppClient]
+) -> None:
+    beside = make_client(workbench=FakeWorkbench, assimilate=False)
+    beside.post("/v1/twins", json=SPEC)
+    feed(beside, 0, 6000)
+    activate(beside)
+    detail = beside.get(TWIN).json()
+    left = {"done": 0, "of": 6000, "state_time": None, "behind_s": 0.0, "since": None}
+    assert (detail["assimilation"], detail["catching_up"]) == (left, True)
+    make_client(workbench=FakeWorkbench)
+    until(lambda: beside.get(TWIN).json()["assimilation"]["done"] == 6000)
+    assert not beside.get(TWIN).json()["catching_up"]
+
+
+def test_a_tracker_of_a_former_tenure_gives_way(postgres: str, make_client: Callable[..., AppClient]) -> None:
+    """A twin is added just before word of a new tenure comes: what was begun in the former one can write nothing."""
+    client = make_client(workbench=FakeWorkbench, database_url=postgres)
+    service = client.app.state.service
+    leases: Leases = service.ownership
+    until(lambda: len(leases.epochs) == SLOTS)
+
+    async def add_between() -> None:
+        made, _ = await service.database.write(twins.register, "benchsat", SPEC)
+        present = leases._holding
+        leases._holding = Holding({slot: epoch - 1 for slot, epoch in present.epochs.items()}, 1)
+        service.add_twin(made)
+        leases._holding = present
+
+    client.portal.call(add_between)
+    feed(client, 0)
+    activate(client)
+    until(lambda: client.get(f"{TWIN}/residuals").json()["samples"] == 60)
