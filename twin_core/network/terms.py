@@ -4,7 +4,7 @@ Every term, declared or discovered, answers one question at many points at once:
 heat into the nodes that it touches together with exact derivatives. The time loop never calls a term; it sees arrays.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -449,13 +449,20 @@ class TableLoad:
         """Return how much each value counts at each point, (n_points, n_values)."""
         return table_basis(along.inputs[self.channel], self.knots, self.levels)
 
+    def looked_up(self, along: Along, values: FloatArray) -> FloatArray:
+        """Return the table at each point, (n_points,): ``basis @ values`` without the basis."""
+        return table_values(along.inputs[self.channel], self.knots, values, self.levels)
+
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
         """Evaluate the table; it is linear in its values."""
-        basis = self.weight * self.basis(along)
+        scale = np.full(along.time_s.size, self.weight)
         if self.solar:
-            basis = basis * along.sun_factor[:, None]
+            scale *= along.sun_factor
         if self.factor is not None:
-            basis = basis * along.inputs[self.factor][:, None]
+            scale *= along.inputs[self.factor]
+        if not along.derivatives:
+            return Heat((self.node,), (scale * self.looked_up(along, values))[:, None], np.zeros((1, 1, 1)), [])
+        basis = scale[:, None] * self.basis(along)
         entries = [Entry(i, self.node, basis[:, i]) for i in range(len(self.parameters))]
         return Heat((self.node,), (basis @ values)[:, None], np.zeros((1, 1, 1)), entries)
 
@@ -473,19 +480,37 @@ class SteeredTable(TableLoad):
 
     def basis(self, along: Along) -> FloatArray:
         """Return how much each value counts at each point, (n_points, n_values)."""
-        now, x = nearest(along.inputs[self.state], self.rests), along.inputs[self.channel]
+        x = along.inputs[self.channel]
         basis = np.zeros((x.size, len(self.knots)))
-        for k, rest in enumerate(self.rests):
-            own, rows = np.flatnonzero(np.array(self.states) == rest), np.flatnonzero(now == k)
-            if own.size:
-                knots = tuple(self.knots[i] for i in own)
-                basis[np.ix_(rows, own)] = table_basis(x[rows], knots, self.levels)
+        for rows, own, knots in self._by_state(along):
+            basis[np.ix_(rows, own)] = table_basis(x[rows], knots, self.levels)
         return basis
+
+    def looked_up(self, along: Along, values: FloatArray) -> FloatArray:
+        """Return the table at each point, (n_points,)."""
+        x = along.inputs[self.channel]
+        out = np.zeros(x.size)
+        for rows, own, knots in self._by_state(along):
+            out[rows] = table_values(x[rows], knots, values[own], self.levels)
+        return out
+
+    def _by_state(self, along: Along) -> Iterator[tuple[IntArray, IntArray, tuple[float, ...]]]:
+        """Yield the points in each state that has knots, the positions of these, and them."""
+        now = nearest(along.inputs[self.state], self.rests)
+        for k, rest in enumerate(self.rests):
+            own = np.flatnonzero(np.array(self.states) == rest)
+            if own.size:
+                yield np.flatnonzero(now == k), own, tuple(self.knots[i] for i in own)
 
 
 def nearest(x: FloatArray, places: Sequence[float]) -> IntArray:
     """Return which place each point is nearest to, (n_points,)."""
     return np.asarray(np.argmin(np.abs(x[:, None] - np.asarray(places, dtype=np.float64)), axis=1))
+
+
+def table_values(x: FloatArray, knots: tuple[float, ...], values: FloatArray, levels: bool) -> FloatArray:
+    """Return ``table_basis(x, knots, levels) @ values``, (n_points,)."""
+    return values[nearest(x, knots)] if levels else np.interp(x, knots, values)
 
 
 def table_basis(x: FloatArray, knots: tuple[float, ...], levels: bool) -> FloatArray:

@@ -1,5 +1,7 @@
 """Terms of the heat balance against hand calculation, and what every table must keep."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from twin_core.network.terms import (
     ChannelLoad,
     Conductors,
     SinkRadiation,
+    SteeredTable,
     TableLoad,
     pair_jacobian,
     table_basis,
@@ -94,6 +97,23 @@ def test_a_table_basis_is_a_partition_of_unity(knots: list[int], x: list[float],
     np.testing.assert_allclose(basis.sum(axis=1), 1.0, rtol=1e-12)
     assert basis.min() >= 0.0
     assert np.count_nonzero(basis, axis=1).max() <= (1 if levels else 2)
+
+
+@given(knots=knot_lists, x=st.lists(st.floats(-60.0, 60.0), min_size=2, max_size=2), levels=st.booleans())
+def test_a_table_is_the_same_without_its_derivatives(knots: list[int], x: list[float], levels: bool) -> None:
+    own = tuple(map(float, knots))
+    values = np.cos(np.array(own))
+    along = replace(ALONG, inputs={"x": np.array(x), "mode": np.array([0.1, 0.9])})
+    parameters = tuple(real(f"f{i}", "W", 0.0) for i in range(len(own)))
+    for table in (
+        TableLoad(0, "x", own, levels, 0.5, True, parameters),
+        SteeredTable(0, "x", own, levels, 0.5, True, parameters, (), None, (1.0,) * len(own), "mode", (0.0, 1.0)),
+    ):
+        told = table.evaluate(along, values)
+        told_alone = table.evaluate(replace(along, derivatives=False), values)
+        np.testing.assert_allclose(told_alone.heat_W, told.heat_W, rtol=1e-12, atol=1e-12)
+        of_entries = sum(entry.series * values[entry.item] for entry in told.d_values)
+        np.testing.assert_allclose(of_entries, told.heat_W[:, 0], rtol=1e-12, atol=1e-12)
 
 
 @given(knots=knot_lists)
