@@ -92,6 +92,8 @@ class Member:
         if entry.key != one.twin:  # another one stands in its place by now, which is told of, too
             return
         self._known[one.twin], self._entries[one.twin] = one, entry
+        if before is None:  # a request may have let it be followed before this, and before what this tells of
+            service.live.archive_changed(entry)
         service.follow(entry)
         if one.seq > service.hub.head(one.twin):
             service.hub.advance(one.twin, one.seq)

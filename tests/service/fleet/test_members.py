@@ -1,5 +1,6 @@
 """Two services on one database: what one does, the other knows."""
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -165,6 +166,29 @@ def activate(client: AppClient) -> None:
     model = {"spec": SPEC, "rmse_K": 1.0, "max_step_s": 60.0}
     assert client.post(f"{TWIN}/models", json=model).status_code == 201
     assert client.post(f"{TWIN}/models/1/activate").status_code == 200
+
+
+def test_an_owner_that_knew_of_a_twin_before_it_heard_of_it_hears_of_its_model(
+    pair: tuple[AppClient, AppClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A request has let it begin to follow the twin; the first word that it hears of it tells of a model that came since."""
+    applied, may_hear = Member._apply, threading.Event()
+
+    async def apply(self: Member, one: Changed) -> None:
+        if may_hear.is_set():
+            await applied(self, one)
+
+    monkeypatch.setattr(Member, "_apply", apply)
+    pair[0].post("/v1/twins", json=SPEC)
+    feed(pair[0], 0)
+    assert [c.get(TWIN).status_code for c in pair] == [200, 200]
+    lives = [c.app.state.service.live for c in pair]
+    tracker = until(lambda: lives[0].find(1) or lives[1].find(1))
+    until(lambda: not tracker._wake.is_set() and not tracker._new_model)  # it has seen that there is no model
+    other = next(c for c, live in zip(pair, lives, strict=True) if live.find(1) is None)
+    activate(other)
+    may_hear.set()
+    until(lambda: other.get(TWIN).json()["assimilation"]["done"] == 60, 90.0)
 
 
 def test_every_process_says_how_far_the_owner_is(pair: tuple[AppClient, AppClient]) -> None:
