@@ -16,6 +16,8 @@ from twin_core.parameters.parameter import Parameter
 N_CENTRES = 9
 WIDTH_SHARES = (0.03, 0.08, 0.2)
 """Widths that are tried, as shares of the visited range."""
+STAY_SHARES = (0.1, 0.2, 0.4)
+"""Of the record: a change of phase is looked for where the node stays so long within the narrowest range."""
 
 WIDEST_SHARE = 0.25
 """The greatest width, as a share of the visited range: centred in it, two standard deviations on either side fill it. Of a wider
@@ -50,6 +52,21 @@ class Melting:
         )
 
 
+def stays_K(visited_K: FloatArray) -> list[tuple[float, float]]:
+    """Return middle and width of the narrowest ranges that hold shares of sorted temperatures (n_points,).
+
+    A change of phase holds its node at one temperature until it is complete, which may lie at the end of what is visited.
+    """
+    found = []
+    for share in STAY_SHARES:
+        n_within = max(int(share * visited_K.size), 2)
+        widths = visited_K[n_within - 1 :] - visited_K[: visited_K.size - n_within + 1]
+        first = int(np.argmin(widths))
+        if widths[first] > 0.0:
+            found.append((float(visited_K[first] + 0.5 * widths[first]), float(widths[first])))
+    return found
+
+
 class LatentHeat(Effect):
     """C -> C + L g(T), g a Gaussian of area one."""
 
@@ -80,9 +97,13 @@ class LatentHeat(Effect):
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
-        """Yield centres evenly over the visited range, each with several widths."""
-        low, high = np.quantile(survey.temperature_K(where["node"]), (0.005, 0.995))
-        for centre in np.linspace(low, high, N_CENTRES + 2)[1:-1] if high > low else ():
-            for share in WIDTH_SHARES:
-                start = {"L_J": 0.0, "T_m_K": float(centre), "w_K": float(share * (high - low))}
-                yield cls(where, start, {"low_K": float(low), "high_K": float(high)})
+        """Yield centres evenly over the visited range, each with several widths, and ranges in which the node stays."""
+        visited_K = np.sort(survey.temperature_K(where["node"]))
+        low, high = np.quantile(visited_K, (0.005, 0.995))
+        if not high > low:
+            return
+        even = [(c, w * (high - low)) for c in np.linspace(low, high, N_CENTRES + 2)[1:-1] for w in WIDTH_SHARES]
+        stays = [(c, w) for c, w in stays_K(visited_K) if w < WIDEST_SHARE * (high - low)]
+        for centre, width in [*even, *stays]:
+            start = {"L_J": 0.0, "T_m_K": float(np.clip(centre, low, high)), "w_K": float(width)}
+            yield cls(where, start, {"low_K": float(low), "high_K": float(high)})

@@ -204,3 +204,21 @@ def test_a_change_of_phase_lies_within_what_was_visited() -> None:
             assert visited_K.min() <= centre.transform.to_value(far_K) <= visited_K.max()
         assert width.transform.to_value(np.log(1000.0)) <= 0.25 * np.ptp(visited_K)
         assert width.transform.to_value(np.log(effect.values["w_K"])) == pytest.approx(effect.values["w_K"])
+
+
+@pytest.mark.parametrize("centre_K", [257.0, 262.0, 281.0])
+@pytest.mark.parametrize("width_K", [0.3, 0.8])
+def test_a_change_of_phase_is_looked_for_where_the_node_stays(centre_K: float, width_K: float) -> None:
+    """A node that cools, and a plateau of its enthalpy's inverse: also one at the end of a record, incomplete."""
+
+    def rate(_: float, t: np.ndarray) -> np.ndarray:
+        capacity = 1.0e4 + 2.0e5 * np.exp(-0.5 * ((t - centre_K) / width_K) ** 2) / (np.sqrt(2.0 * np.pi) * width_K)
+        return 2.0 * (240.0 - t) / capacity
+
+    time_s = np.linspace(0.0, 15_000.0, 400)
+    cooled = solve_ivp(rate, (0.0, time_s[-1]), [288.0], t_eval=time_s, max_step=20.0, rtol=1e-8).y[0]
+    network = every_term_network()
+    survey = survey_of(network, points(network, 400))
+    survey.along.temperatures_K[:, network.nodes.index("a")] = cooled
+    starts = [e.values for e in REGISTRY["latent_heat"].starts({"node": "a"}, survey)]
+    assert any(abs(v["T_m_K"] - centre_K) < width_K and 0.5 < v["w_K"] / width_K < 2.0 for v in starts)
