@@ -21,6 +21,7 @@ from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
+    SIZE_NOT_DETERMINED,
     Judged,
     Search,
     accept,
@@ -31,7 +32,7 @@ from twin_core.discover.judge import (
 from twin_core.discover.revision import exchange, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
-from twin_core.discover.trajectories import extend_by_trajectory
+from twin_core.discover.trajectories import SETTLING_NATS, extend_by_trajectory
 from twin_core.effects.base import Effect, Place
 
 MAX_FINDINGS = 4
@@ -42,9 +43,6 @@ N_FREE_PLACES = 2
 N_PAIR_PROBES = 16
 N_PAIR_REFITS = 5
 N_SETTLED = 3
-SETTLING_NATS = 40.0
-"""Options this far behind after a few passes are not fitted further."""
-
 RIVAL_NATS = 20.0
 """Forms this near the best one at its place are compared once more."""
 
@@ -57,6 +55,9 @@ search without a deadline is not touched by it."""
 
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
+
+UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED)
+"""Why a single effect may be refused that is seen only beside another one."""
 
 
 def search(
@@ -157,8 +158,9 @@ def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
     """Return the likeliest single effect that was refused for what it does to trajectories, if any.
 
     A lagging sensor, say, shows between neighbouring readings and changes no long trajectory; what does may show beside it only.
+    Nor is the size of an effect determined where the model's parameters follow another one that is missing too.
     """
-    singles = [j for j in refused if j.reason in (NO_FORESIGHT, LESS_LIKELY) and len(j.effects) == 1]
+    singles = [j for j in refused if j.reason in UNSEEN and len(j.effects) == 1]
     return [min(singles, key=worth).trial] if singles else []
 
 

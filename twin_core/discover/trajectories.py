@@ -31,6 +31,9 @@ MOST_TOGETHER = 2
 LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
 
+SETTLING_NATS = 40.0
+"""Options this far behind after a few passes are not fitted further."""
+
 N_KEPT, N_SETTLED = 4, 2
 """Sets of effects that are extended by one more, and that are fitted in the presence of undeclared heat too."""
 
@@ -96,11 +99,14 @@ def _judged(state: Search, trial: Trial, n_tried: int) -> Judged:
 
 
 def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: float) -> list[Judged]:
-    """Return the options that are likely, with their parameters fitted in the presence of undeclared heat too."""
+    """Return the options that are or may become likely, with their parameters fitted in the presence of undeclared heat too.
+
+    Along trajectories the undeclared heat is left as it was: only beside it is seen how little of it an option needs.
+    """
 
     def settled(judged: Judged) -> Judged:
         return _judged(state, resettled(state.trial, judged.trial), n_tried)
 
-    likely = [j for j in options if j.evidence.log_bayes_factor > needed]
+    likely = [j for j in options if j.evidence.log_bayes_factor > needed - SETTLING_NATS]
     done = [state.attempt(partial(settled, j), f"{j.labels} on trajectories") for j in likely]
     return [j for j in done if j is not None]

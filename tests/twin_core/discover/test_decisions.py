@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin_core.discover import judge, policy, revision
+from twin_core.discover import judge, policy, revision, trajectories
+from twin_core.discover import search as searching
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.form import Repeatable
@@ -633,3 +634,25 @@ def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:
     for thread in threads:
         thread.join(timeout=30.0)
     assert [thing.value() for thing in objects] == [7, 7] and len(calls) == 2
+
+
+@pytest.mark.parametrize(
+    ("reason", "is_kept"),
+    [(NO_FORESIGHT, True), (LESS_LIKELY, True), (SIZE_NOT_DETERMINED, True), (NOT_SUPPORTED, False), (NO_LAW, False)],
+)
+def test_what_may_show_beside_another_effect_only_is_tried_with_others(reason: str, is_kept: bool) -> None:
+    single, likelier = (replace(judged(node, nats), reason=reason) for node, nats in (("a", 50.0), ("b", 90.0)))
+    both = replace(likelier, effects=(load("a"), load("b")), evidence=Evidence(200.0, 0.0), reason=reason)
+    kept = searching._unseen_by_trajectories([single, both, likelier])
+    assert [trial is likelier.trial for trial in kept] == ([True] if is_kept else [])
+
+
+@pytest.mark.parametrize(("nats", "is_settled"), [(NEEDED - 40.0 + JUST, True), (NEEDED - 40.0, False), (90.0, True)])
+def test_an_option_is_settled_that_may_become_likely(
+    monkeypatch: pytest.MonkeyPatch, nats: float, is_settled: bool
+) -> None:
+    option, settled = judged("a", nats), judged("a", 200.0).trial
+    monkeypatch.setattr(trajectories, "resettled", lambda simple, trial: settled)
+    monkeypatch.setattr(trajectories, "weigh", lambda *arguments: Evidence(200.0, 0.0))
+    found = trajectories._settled(Search(stub(), stub()), [option], 1, NEEDED)
+    assert [j.trial for j in found] == ([settled] if is_settled else [])
