@@ -83,7 +83,6 @@ def close_loop(
     spacecraft does.
     """
     from replay.cli.console import notify, print_line, progress_bar, to_json
-    from replay.cli.fleet import close_fleet
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import check_apart, load_records
     from replay.cli.signed import document
@@ -96,13 +95,9 @@ def close_loop(
             raise click.UsageError(
                 "--fleet excludes --spec, --telemetry and --holdout-telemetry; each folder holds its own"
             )
-        if not re.fullmatch(r"process|dask://[^/]+:[0-9]+", executor):
-            raise click.UsageError(f"--executor must be process or dask://HOST:PORT (got {executor})")
         options = {"holdout": 0.3 if holdout is None else holdout, "false_alarm_rate": false_alarm_rate}
         options |= {} if deadline is None else {"deadline_s": deadline}
-        reports = close_fleet(fleet, executor, out, options, masking=not no_masking)
-        _print_fleet(reports, out, as_json)
-        _refuse_failed(reports)
+        _close_fleet(fleet, executor, out, options, masking=not no_masking, as_json=as_json)
         return
     if spec_file is None or not telemetry:
         raise click.UsageError("give --spec and --telemetry, or --fleet")
@@ -180,6 +175,19 @@ def _save(loop: "ClosedLoop", out: Path) -> None:
     write_text(out / "model.json", to_json(loop.model.to_json()))
     write_text(out / "report.json", to_json(loop.report))
     write_text(out / "report.html", render(loop.report, loop.plots))
+
+
+def _close_fleet(
+    fleet: Path, executor: str, out: Path, options: dict[str, Any], *, masking: bool, as_json: bool
+) -> None:
+    """Close the loop on every folder of a fleet; click.ClickException where one failed."""
+    from replay.cli.fleet import close_fleet
+
+    if not re.fullmatch(r"process|dask://[^/]+:[0-9]+", executor):
+        raise click.UsageError(f"--executor must be process or dask://HOST:PORT (got {executor})")
+    reports = close_fleet(fleet, executor, out, options, masking=masking)
+    _print_fleet(reports, out, as_json)
+    _refuse_failed(reports)
 
 
 def _refuse_failed(reports: dict[str, dict[str, Any]]) -> None:

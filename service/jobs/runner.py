@@ -167,11 +167,9 @@ class Jobs:
             await self._free.acquire()
             held = None
             try:
-                await self._reach()
-                claiming = (self._name, round(1e6 * LEASE_S))
-                held = await self._database.write(jobs.claim, *claiming, is_shared=self._database.is_shared)
-            except ExecutorLost:
-                pass
+                if await self._is_reached():
+                    claiming = (self._name, round(1e6 * LEASE_S))
+                    held = await self._database.write(jobs.claim, *claiming, is_shared=self._database.is_shared)
             except Exception as error:  # such as a database that is away: the queue stays as it is
                 log.warning("no job can be claimed", extra={"reason": f"{type(error).__name__}: {error}"})
             if held is not None:
@@ -184,18 +182,19 @@ class Jobs:
                 async with asyncio.timeout(LOOK_EVERY_S):
                     await self._wake.wait()
 
-    async def _reach(self) -> None:
-        """Return if what computes is there; otherwise say so once, and ExecutorLost."""
+    async def _is_reached(self) -> bool:
+        """Return whether what computes is there; the log says once that it is not, and once that it is again."""
         try:
             await asyncio.to_thread(self._executor.reach)
         except ExecutorLost as error:
             if not self._is_away:
                 log.error("what computes is away; no job is taken until it is there", extra={"reason": str(error)})
             self._is_away = True
-            raise
+            return False
         if self._is_away:
             log.warning("what computes is there again")
         self._is_away = False
+        return True
 
     async def _beat_forever(self) -> None:
         """Say that this worker lives; let go of jobs that are in other hands, and end those that somebody cancelled."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.errors import Refusal
 from service.live import screening
 from service.live.engine import Engine
 from service.live.position import RECENT, Json, Position, stretch
@@ -12,11 +13,17 @@ from service.live.progress import Step
 from service.store import samples
 from service.store.anomalies import Change
 from service.store.database import Database
+from service.store.errors import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.twins.registry import Entry
 from service.workbench.interface import Filtered, Stretch, Telemetry, Watch
 from twin_core.anomaly import Thresholds
+from twin_core.errors import TwinError
+
+
+class NotFollowed(Exception):
+    """The filter cannot make sense of samples, whatever the reason: it would come again with the same ones."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +44,22 @@ class Following:
         self._engine, self._thresholds = engine, thresholds
 
     async def filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
-        """Filter a block from a position and look for anomalies in it; TwinError or Refusal if it cannot be done."""
+        """Filter a block from a position and look for anomalies in it.
+
+        Raises
+        ------
+        NotFollowed
+            If the samples are to blame. What the database or a deleted twin is to blame for is raised as it is.
+        """
+        try:
+            return await self._filter(active, before, fresh)
+        except Exception as error:
+            if isinstance(error, TwinGone) or self._database.is_fault(error):
+                raise
+            told = str(error) if isinstance(error, TwinError | Refusal) else f"{type(error).__name__}: {error}"
+            raise NotFollowed(told) from error
+
+    async def _filter(self, active: Active, before: Position | None, fresh: Samples) -> Followed:
         clean, seen = await self._readings(fresh, before)
         telemetry, held = stretch(self._twin, clean, active.epoch_us, before)
         state = None if before is None else before.state

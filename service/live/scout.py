@@ -11,12 +11,11 @@ import numpy as np
 from service.errors import Refusal
 from service.fleet.ownership import Guard
 from service.live.caution import Caution
-from service.live.following import Following
+from service.live.following import Following, NotFollowed
 from service.live.position import Position, is_far, next_count
 from service.live.progress import ahead, save
 from service.store import samples
 from service.store.database import Database
-from service.store.errors import TwinGone
 from service.store.models import Active
 from service.store.samples import Samples
 from service.stream.hub import Hub
@@ -108,13 +107,7 @@ class Scout:
             fresh = await self._following.opened(fresh)
         try:
             done = await self._following.filter(self._active, before, fresh)
-        except TwinGone:
-            raise
-        except (
-            Exception
-        ) as error:  # whatever it is, unless it is the database, it would come again with the same samples
-            if self._database.is_fault(error):
-                raise
+        except NotFollowed as error:
             if self._caution.failed(fresh.time_us, 0):
                 self._after_us = int(fresh.time_us[-1])
             log.info("the newest samples cannot be followed", extra={"twin": self._twin.name, "reason": str(error)})

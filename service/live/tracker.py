@@ -4,13 +4,12 @@ import asyncio
 import logging
 from dataclasses import dataclass, replace
 
-from service.errors import Refusal
 from service.fleet.ownership import Guard
 from service.instants import format_instant
 from service.live import progress
 from service.live.caution import Caution, Rest
 from service.live.engine import Engine
-from service.live.following import Followed, Following
+from service.live.following import Followed, Following, NotFollowed
 from service.live.position import Position, is_far, next_count
 from service.live.progress import Outdated, Reading
 from service.live.scout import Base, Scout
@@ -24,7 +23,6 @@ from service.store.samples import Samples
 from service.stream.hub import Hub
 from service.twins.registry import Entry
 from twin_core.anomaly import Thresholds
-from twin_core.errors import TwinError
 
 log = logging.getLogger("service.live")
 
@@ -230,6 +228,7 @@ class Tracker:
             raise
 
     async def _find(self, anew: bool) -> None:
+        """Take over the active model and its last checkpoint, unless it is followed already and not to begin anew."""
         active = await self._database.read(models.active, self.twin.key)
         if active is None:
             self.active, self.catching_up, self._detour = None, False, None
@@ -309,14 +308,8 @@ class Tracker:
         try:
             with tracing.part("filter", _told(self.twin, active, fresh), cause=self.twin.key):
                 done = await self._following.filter(active, before, fresh)
-        except TwinGone:
-            raise
-        except (
-            Exception
-        ) as error:  # whatever it is, unless it is the database, it would come again with the same samples
-            if self._database.is_fault(error):
-                raise
-            self.trouble = str(error) if isinstance(error, TwinError | Refusal) else f"{type(error).__name__}: {error}"
+        except NotFollowed as error:
+            self.trouble = str(error)
             if caution.failed(fresh.time_us, reading.seq):
                 self._metrics.skipped.inc(int(fresh.time_us.size))
                 extra = {"twin": self.twin.name, "reason": self.trouble, "samples": int(fresh.time_us.size)}

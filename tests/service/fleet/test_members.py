@@ -240,4 +240,4 @@ def test_a_tracker_of_a_former_tenure_gives_way(postgres: str, make_client: Call
     client.portal.call(add_between)
     feed(client, 0)
     activate(client)
-    until(lambda: client.get(f"{TWIN}/residuals").json()["samples"] == 60)
+    assert until(lambda: client.get(f"{TWIN}/residuals").json()["samples"] == 60)

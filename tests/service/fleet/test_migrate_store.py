@@ -51,7 +51,7 @@ def test_who_was_killed_is_waited_for_no_longer_than_a_lease(tmp_path: Path, pos
     with fleet(tmp_path, [postgres]) as (service,):
         service.kill()
     target = iter(range(1000))
-    until(lambda: moved(postgres, f"sqlite:///{tmp_path / f'copy{next(target)}.sqlite3'}") == 0)
+    assert until(lambda: moved(postgres, f"sqlite:///{tmp_path / f'copy{next(target)}.sqlite3'}") == 0)
 
 
 @pytest.mark.parametrize(
