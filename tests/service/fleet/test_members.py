@@ -208,18 +208,16 @@ def test_every_process_says_how_far_the_owner_is(pair: tuple[AppClient, AppClien
     until(lambda: told() == [(done, False)] * 2)
 
 
-def test_a_process_that_follows_nothing_says_what_is_left(
-    database_url: str, make_client: Callable[..., AppClient]
-) -> None:
-    beside = make_client(workbench=FakeWorkbench, assimilate=False)
+def test_a_process_that_follows_nothing_says_what_is_left(postgres: str, make_client: Callable[..., AppClient]) -> None:
+    beside = make_client(workbench=FakeWorkbench, database_url=postgres, assimilate=False)
     beside.post("/v1/twins", json=SPEC)
     feed(beside, 0, 6000)
     activate(beside)
     detail = beside.get(TWIN).json()
     left = {"done": 0, "of": 6000, "state_time": None, "behind_s": 0.0, "since": None}
     assert (detail["assimilation"], detail["catching_up"]) == (left, True)
-    make_client(workbench=FakeWorkbench)
-    until(lambda: beside.get(TWIN).json()["assimilation"]["done"] == 6000)
+    make_client(workbench=FakeWorkbench, database_url=postgres)
+    assert until(lambda: beside.get(TWIN).json()["assimilation"]["done"] == 6000)
     assert not beside.get(TWIN).json()["catching_up"]
 
 
