@@ -125,14 +125,16 @@ def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> boo
     needed
         Log Bayes factor that is asked for: by so much the other one must be likelier, and the finding must add beside it.
     """
+    undetermined = [j for j in refused if j.reason == SIZE_NOT_DETERMINED]
+    if not undetermined:
+        return False
     found = state.findings[-1].judged
     left = mean_excess(state.trial)
     own = {effect.place for effect in found.effects}
     likelier = [
         j
-        for j in refused
-        if j.reason == SIZE_NOT_DETERMINED
-        and worth(j) < worth(found) - needed
+        for j in undetermined
+        if worth(j) < worth(found) - needed
         and policy.DOMINANCE * mean_excess(j.trial) < left
         and own.isdisjoint(effect.place for effect in j.effects)
     ]
