@@ -71,9 +71,10 @@ def test_a_job_interrupted_by_a_kill_is_marked_failed_and_leaves_no_process(tmp_
     with Server(tmp_path) as server:
         client = server.client()
         client.register(SPEC)
-        times = [60.0 * k for k in range(3000)]
-        client.ingest("benchsat", times, {"T_px": [290 + k % 7 for k in range(3000)], "Q_px": [1.0] * 3000})
-        job = client.calibrate("benchsat")
+        n = 20_000
+        read = {"T_px": [290 + k % 7 for k in range(n)], "T_tank": [20 + k % 11 for k in range(n)], "Q_px": [1.0] * n}
+        client.ingest("benchsat", [60.0 * k for k in range(n)], read)
+        job = client.calibrate("benchsat", samples=n)
         while job.state != "running":
             job = client.job("benchsat", job)
         time.sleep(0.5)
