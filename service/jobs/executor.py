@@ -31,6 +31,11 @@ T = TypeVar("T")
 
 _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 """Gives freed memory back to the system: the GNU allocator keeps what lies between arrays that are still in use."""
+_CHOOSE = getattr(ctypes.CDLL(None), "mallopt", None)
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Names of settings in its malloc.h."""
+APART_BYTES = 16 * 2**20
+"""What a job frees of this size goes back at once. By itself the allocator keeps ever larger pieces, up to 32 MB."""
 
 END_GRACE_S = 2.0
 POLL_S = 0.2
@@ -214,9 +219,19 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
+def keep_freed(apart_bytes: int, kept_bytes: int | None = None) -> None:
+    """Let this process give back pieces of ``apart_bytes`` as they are freed, and keep ``kept_bytes`` of smaller ones."""
+    if _CHOOSE is None:
+        return
+    _CHOOSE(M_MMAP_THRESHOLD, apart_bytes)
+    if kept_bytes is not None:
+        _CHOOSE(M_TRIM_THRESHOLD, kept_bytes)
+
+
 def _run(connection: Connection, name: str, args: tuple[Any, ...]) -> None:
     """Do the task: the whole life of a worker process."""
     prepare_worker()
+    keep_freed(APART_BYTES)
     os.nice(NICENESS)
     module, _, qualified = name.partition(":")
     function: Any = importlib.import_module(module)

@@ -1,7 +1,6 @@
 """The engine: standing worker processes for assimilation and forecasts, replaced when one dies."""
 
 import asyncio
-import ctypes
 import logging
 import multiprocessing
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -10,7 +9,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
 from service.errors import Refusal
-from service.jobs.executor import prepare_worker
+from service.jobs.executor import keep_freed, prepare_worker
 from service.live.batches import Batches
 from service.workbench.interface import (
     Filtered,
@@ -35,8 +34,6 @@ SHORT = 64
 """Stretches of more samples go by themselves: nobody shall wait for a twin that catches up."""
 KEPT_BYTES = 32 * 2**20
 """So much freed memory a worker process keeps at most: a forecast of a hundred thousand numbers takes less."""
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Names of settings in the GNU allocator's malloc.h."""
 log = logging.getLogger("service.live")
 
 
@@ -122,10 +119,7 @@ def _start(workers: int) -> ProcessPoolExecutor:
 def _prepare() -> None:
     """Make a standing worker keep some freed memory: to get megabytes page by page is a sixth of a forecast's time."""
     prepare_worker()
-    choose = getattr(ctypes.CDLL(None), "mallopt", None)  # of the GNU allocator
-    if choose is not None:
-        choose(M_MMAP_THRESHOLD, KEPT_BYTES // 2)
-        choose(M_TRIM_THRESHOLD, KEPT_BYTES)
+    keep_freed(KEPT_BYTES // 2, KEPT_BYTES)
 
 
 def _assimilate(workbench: MakeWorkbench, stretches: Sequence[Stretch]) -> Sequence[Filtered | Exception]:

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from benchmarks.network_cases import network_case
 from tests.helpers import conductive_spec, model_of, record_of
-from twin_core.assimilate import assimilate
+from twin_core.assimilate import FLOOR_SHARE, assimilate
 from twin_core.calibrate import calibrate
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
@@ -75,11 +75,14 @@ def test_a_plan_with_nothing_in_it_changes_nothing(gap: float | None) -> None:
 
 
 def test_bands_add_state_noise_and_parameters() -> None:
-    """The closed form of an integrator: dT / d ln C = -Q t / C."""
+    """The closed form of an integrator: dT / d ln C = -Q t / C, t from when the filter has last forgotten."""
     model = integrator(std=0.1)
     found = forecast(model, now(20.0), 2000.0, step_s=250.0, state=known_start(std_K=0.5), quantiles=(0.05, 0.5, 0.95))
     lead = found.time_s - NOW_S
-    std = np.sqrt(0.5**2 + NOISE_K**2 + (0.1 * 20.0 * lead / CAPACITY_J_PER_K) ** 2)
+    before_K2 = 0.5**2 + (FLOOR_SHARE * NOISE_K) ** 2
+    gain = before_K2 / (before_K2 + NOISE_K**2)
+    lag_s = 250.0 * (1.0 - gain) / gain
+    std = np.sqrt(0.5**2 + NOISE_K**2 + (0.1 * 20.0 * (lag_s + lead) / CAPACITY_J_PER_K) ** 2)
     np.testing.assert_allclose(found.quantiles_K[0.5], found.mean_K)
     np.testing.assert_allclose(found.quantiles_K[0.95][:, 0] - found.mean_K[:, 0], norm.ppf(0.95) * std, rtol=1e-6)
     np.testing.assert_allclose(found.quantiles_K[0.95] + found.quantiles_K[0.05], 2.0 * found.mean_K)

@@ -1,5 +1,6 @@
 """How certain the unknowns of a fit are, in the metric of the noise that the fit was made from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,21 +38,36 @@ def gls_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> Fl
     return directions @ directions.T
 
 
-def trajectory_covariance(problem: Problem, optimum: Optimum, whitener: Whitener) -> FloatArray:
+def noise_of_fit(problem: Problem, optimum: Optimum, whitener: Whitener) -> list[ExpectedNoise]:
+    """Return the noise of each sensor that a fit to trajectories was made from, by restricted likelihood.
+
+    Of readings that Huber's loss holds back counts what it leaves them.
+    """
+    residuals = _bounded(problem, optimum)
+    if np.isfinite(problem.huber):
+        whitener = fit_whitener(problem, residuals)
+    return restricted_noise(problem, optimum, whitener, residuals)
+
+
+def _bounded(problem: Problem, optimum: Optimum) -> list[FloatArray]:
+    """Return what a fit leaves as far as its loss counts it, (n_samples, n_sensors) per segment."""
+    limit_K = problem.huber * problem.noise_K
+    return [np.clip(residual, -limit_K, limit_K) for residual in problem.residuals(optimum.fit)]
+
+
+def trajectory_covariance(
+    problem: Problem, optimum: Optimum, whitener: Whitener, noise: Sequence[ExpectedNoise] | None = None
+) -> FloatArray:
     """Return the covariance of the unknowns of a fit to trajectories, (n_unknowns, n_unknowns).
 
     The fit weighs every reading alike, whatever the colour of the misfit, so that its covariance is
     H⁻¹ (Jᵀ W Σ W J + P) H⁻¹ (Huber 1967): W the weights of the readings, P the priors, H = Jᵀ W J + P, and Σ the noise by
-    restricted likelihood. Readings that Huber's loss holds back pull with what it leaves them, and bend nothing.
+    restricted likelihood (``noise_of_fit``, if it is not given). Readings that Huber's loss holds back pull with what it leaves
+    them, and bend nothing.
     """
     _, std = problem.prior()
-    limit_K = problem.huber * problem.noise_K
-    residuals = [np.clip(residual, -limit_K, limit_K) for residual in problem.residuals(optimum.fit)]
-    if np.isfinite(problem.huber):
-        whitener = fit_whitener(problem, residuals)
-    noise = restricted_noise(problem, optimum, whitener, residuals)
-    residual = np.concatenate(residuals)
-    bends = np.abs(residual) < limit_K
+    noise = noise_of_fit(problem, optimum, whitener) if noise is None else noise
+    bends = np.abs(np.concatenate(_bounded(problem, optimum))) < problem.huber * problem.noise_K
     turned = told_directions(optimum.hessian, UNTOLD)  # in which nothing is lost to rounding
     hessian = turned.T @ (turned / std[:, None] ** 2)
     spread = hessian.copy()

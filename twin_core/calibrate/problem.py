@@ -136,6 +136,11 @@ class Problem:
         return sum(segment.record.time_s.size for segment in self.segments)
 
     @property
+    def span_s(self) -> float:
+        """Length of the longest segment."""
+        return max(float(np.ptp(segment.record.time_s)) for segment in self.segments)
+
+    @property
     def n_nodes(self) -> int:
         """Number of states."""
         return len(self.network.nodes)

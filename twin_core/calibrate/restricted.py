@@ -87,6 +87,21 @@ class ExpectedNoise:
     white_K2: float
     coloured: tuple[tuple[float, float], ...]
 
+    @property
+    def misfit(self) -> tuple[float, float] | None:
+        """Standard deviation in K and correlation length in s of one part that varies as much and grows as fast as all."""
+        if not self.coloured:
+            return None
+        variance_K2 = sum(v for v, _ in self.coloured)
+        return float(np.sqrt(variance_K2)), variance_K2 / sum(v / length for v, length in self.coloured)
+
+
+def no_longer(model: ResidualNoise, span_s: float) -> ResidualNoise:
+    """Return a noise that grows as fast and lasts no longer than a record of length ``span_s``, which tells no more of it."""
+    if model.length_s <= span_s:
+        return model
+    return replace(model, sigma_ou=model.sigma_ou * np.sqrt(span_s / model.length_s), length_s=span_s)
+
 
 def _kept(width: float) -> float:
     """Return the share of an Ornstein-Uhlenbeck variance that an average over ``width`` lengths keeps."""
@@ -109,8 +124,8 @@ def restricted_noise(
     """
     mean, std = problem.prior()
     rows = np.column_stack([np.diag(1.0 / std), (mean - optimum.unknowns) / std])
-    span_s = max(float(np.ptp(segment.record.time_s)) for segment in problem.segments)
-    return expected_noise(_leftovers(problem, optimum, whitener, residuals), rows.T @ rows, whitener.models, span_s)
+    left = _leftovers(problem, optimum, whitener, residuals)
+    return expected_noise(left, rows.T @ rows, whitener.models, problem.span_s)
 
 
 def _leftovers(
@@ -178,10 +193,11 @@ def expected_noise(
     prior : (n_unknowns + 1, n_unknowns + 1)
         Priors of the unknowns, as products of columns like those of ``left``.
     models
-        Noise of what was left, one per sensor.
+        Noise of what was left, one per sensor; what lasts longer than the segment counts as if it lasted as long.
     span_s
         Length of the longest segment.
     """
+    models = [no_longer(model, span_s) for model in models]
     turned = _told(left, prior, models)
     told = [replace(part, columns=part.columns @ turned) for part in left]
     options = [[model, *_misfits(model, span_s)] for model in models]

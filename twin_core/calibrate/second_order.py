@@ -10,13 +10,14 @@ import numpy as np
 from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
 from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
-from twin_core.calibrate.covariance import is_open_ended, trajectory_covariance
+from twin_core.calibrate.covariance import is_open_ended, noise_of_fit, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener
+from twin_core.calibrate.restricted import ExpectedNoise, no_longer
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
 from twin_core.calibrate.statistics import residual_whiteness, score
@@ -292,14 +293,21 @@ def _step_error(problem: Problem, finer: Problem) -> float:
 def to_model(
     calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
 ) -> CalibratedModel:
-    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told."""
+    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told.
+
+    Where it states one, its misfit is that which the fit was made from, else what the fit has left of it.
+    """
     problem = calibration.problem
     network, spec = calibration.network, calibration.network.spec
     free, failures = None, list[str]()
+    left = [no_longer(model, problem.span_s) for model in calibration.whitener.models]
+    misfit = [(float(model.sigma_ou), float(model.length_s)) for model in left]
     if uncertain:
-        free = attempted(partial(_covariance, calibration), NO_UNCERTAINTY, failures)
+        told = attempted(partial(_uncertainty, calibration), NO_UNCERTAINTY, failures)
+        if told is not None:
+            free, noise = told
+            misfit = [own.misfit or (0.0, length_s) for own, (_, length_s) in zip(noise, misfit, strict=True)]
     values = network.parameters.as_dict()
-    misfit = dict(zip(spec.sensors, calibration.whitener.models, strict=True))
     return CalibratedModel(
         spec,
         tuple(_carrying(effect.at_parameters(values), network.parameters.free_names, free) for effect in effects),
@@ -307,21 +315,22 @@ def to_model(
         np.zeros((0, 0)) if free is None else free,
         () if free is None else network.parameters.free_names,
         {s: float(n) for s, n in zip(spec.sensors, problem.noise_K, strict=True)},
-        {s: float(m.sigma_ou) for s, m in misfit.items()},
-        {s: float(m.length_s) for s, m in misfit.items()},
+        {s: std_K for s, (std_K, _) in zip(spec.sensors, misfit, strict=True)},
+        {s: length_s for s, (_, length_s) in zip(spec.sensors, misfit, strict=True)},
         calibration.max_step_s,
         dict(network.layout.table_knots),
         _summary(calibration, effects, free, [*notices, *failures]),
     )
 
 
-def _covariance(calibration: Calibration) -> FloatArray:
-    """Return the covariance of the free parameters; ArithmeticError where it is not finite."""
-    n_free = calibration.problem.n_free
-    full = trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
-    if not np.isfinite(full[:n_free, :n_free]).all():
+def _uncertainty(calibration: Calibration) -> tuple[FloatArray, list[ExpectedNoise]]:
+    """Return the covariance of the free parameters and the noise it comes from; ArithmeticError where it is not finite."""
+    fit = calibration.problem, calibration.optimum, calibration.whitener
+    noise = noise_of_fit(*fit)
+    free = trajectory_covariance(*fit, noise)[: calibration.problem.n_free, : calibration.problem.n_free]
+    if not np.isfinite(free).all():
         raise ArithmeticError("it is not finite")
-    return full[:n_free, :n_free]
+    return free, noise
 
 
 def stated_guesses(network: Network) -> dict[str, float]:

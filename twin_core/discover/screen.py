@@ -64,7 +64,7 @@ def survey_of(fit: HeatFit) -> Survey:
     parts: list[Along] = []
     rates = []
     for nominal in fit.nominals:
-        forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
+        forcing, stages = nominal.segment.forcing, nominal.stages_K
         flat = forcing.boundaries_flat_K(0, forcing.n_steps)
         filled = fill_boundaries(network, values, flat)
         points = forcing.along(stages.reshape(-1, stages.shape[2]), filled, 0, forcing.n_steps)
@@ -135,7 +135,7 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
     """
     network, blocks = fit.problem.network, []
     for nominal, window in zip(fit.nominals, survey.segments(), strict=True):
-        forcing, stages = nominal.segment.forcing, nominal.steps.stages_K
+        forcing, stages = nominal.segment.forcing, nominal.stages_K
         balance = balance_along(network, fit.values, forcing, stages, 0, forcing.n_steps, extra_W=nominal.extra_W)
         heats = [(k, node, series[window]) for k, (heat, _) in enumerate(columns) for node, series in heat]
         block = heat_response(balance, forcing, heats, len(columns), network.sensor_node)

@@ -120,7 +120,9 @@ def forecast(
     read += reading_offsets_K(network, values, future.clock_s)
     wanted = np.flatnonzero(np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:]))
     beyond = extrapolations(network, model.effects, forcing, path)
-    about = spread(model, network, forcing, path, covariance_K2, future.time_s, wanted, [b for _, b in beyond])
+    sampling_s = next((_sampling_s(r) for r in (record, before) if r.time_s.size > 1), step)
+    outside = [b for _, b in beyond]
+    about = spread(model, network, forcing, path, covariance_K2, future.time_s, wanted, outside, sampling_s)
     found = missed(assumed.rules, now_s, forcing)
     moved = np.zeros((0, wanted.size, network.sensor_node.size))
     if found is not None:

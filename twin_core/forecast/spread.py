@@ -4,6 +4,9 @@ The misfit of a calibration is how far readings lie from a rollout that nothing 
 each sensor. A state that follows the readings has taken M(0) for a temperature, and the network forgets it at its own pace,
 not at that of the misfit. So the rollout misses M(t) - Phi(t) M(0), where Phi is how a start moves the readings: nothing at
 first, and the whole misfit once the start is forgotten, however slowly M itself moves.
+
+A parameter that is wrong has misled the filter too: hidden nodes have been moved until the model follows the readings in spite
+of it. Errors of state and parameters go together, and largely cancel, as long as the inputs are like those before.
 """
 
 from collections.abc import Sequence
@@ -12,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin_core._typing import Float32Array, FloatArray, IntArray
+from twin_core.assimilate import process_noise_K2_per_s
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.base import Beyond
 from twin_core.forecast.bands import normals
@@ -25,6 +29,8 @@ DRAWS = 512
 """Paths that are drawn: a share of 0.9 is then known to 0.013."""
 MOST_DRAWN = 4_000_000
 """Numbers of all drawn paths together; between the instants that are kept for it they are taken to be smooth."""
+DOUBLINGS = 20
+"""A filter is taken to have run for a million samples."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,7 @@ def spread(
     time_s: FloatArray,
     wanted: IntArray,
     beyond: Sequence[Beyond],
+    sampling_s: float,
 ) -> Spread:
     """Return variance of, and paths through, what is uncertain apart from the inputs.
 
@@ -68,9 +75,12 @@ def spread(
         Positions among ``time_s`` of the instants that are asked for.
     beyond
         Where effects leave what they were learned from.
+    sampling_s
+        Between two readings that the filter has followed.
     """
     n_free, n_nodes, n_sensors = int(network.parameters.free_index.size), len(network.nodes), len(model.spec.sensors)
-    starts = np.hstack([np.zeros((n_nodes, n_free)), np.eye(n_nodes)])
+    moved = misled(model, network, forcing, path, state_covariance_K2, sampling_s)
+    starts = np.hstack([moved, np.eye(n_nodes)])
     covariance = np.zeros((n_free + n_nodes, n_free + n_nodes))
     if model.free_names:  # a method may state no covariance
         covariance[:n_free, :n_free] = model.covariance
@@ -104,6 +114,55 @@ def spread(
         _add_misfit(paths, misfit, length, lead[kept])
     grown = misfit**2 * (1.0 - np.exp(-2.0 * lead[:, None] / length))
     return Spread(variance + outside + grown + model.noise_vector_K() ** 2, kept, paths)
+
+
+def misled(
+    model: CalibratedModel,
+    network: Network,
+    forcing: Forcing,
+    path: Rollout,
+    state_covariance_K2: FloatArray,
+    sampling_s: float,
+) -> FloatArray:
+    """Return d filtered state / d free parameter, (n_nodes, n_free), of a filter that has long run under present inputs.
+
+    It is the fixed point of S = (I - K H) (Phi S + G), Phi and G how state and parameters move a state until the next readings,
+    K the gain (Schmidt 1966: a filter that considers parameters which it does not estimate).
+
+    Parameters
+    ----------
+    model, network, forcing, path
+        A converged rollout from the present.
+    state_covariance_K2 : (n_nodes, n_nodes)
+        Of the filtered state.
+    sampling_s
+        Between two readings. Where the steps of the rollout are longer, as many readings as come within one are taken together.
+    """
+    n_free, n_nodes = int(network.parameters.free_index.size), len(network.nodes)
+    if forcing.n_steps == 0 or n_free == 0:
+        return np.zeros((n_nodes, n_free))
+    elapsed_s = np.cumsum(forcing.step_s)
+    n_steps = int(np.argmin(np.abs(elapsed_s - sampling_s))) + 1
+    ahead_s = float(elapsed_s[n_steps - 1])
+    opening = replace(path, stages_K=path.stages_K[:n_steps])
+    starts = np.hstack([np.zeros((n_nodes, n_free)), np.eye(n_nodes)])
+    nodes = np.arange(n_nodes)
+    values = network.parameters.values
+    blocks = sensitivities(network, values, forcing.opening(n_steps), opening, starts, nodes)
+    block = np.concatenate([b for _, b in blocks])[-1]
+    by_parameter, by_state = block[:, :n_free], block[:, n_free:]
+    read = np.zeros((network.sensor_node.size, n_nodes))
+    read[np.arange(network.sensor_node.size), network.sensor_node] = 1.0
+    process_K2 = process_noise_K2_per_s(model, network, sampling_s) * ahead_s
+    predicted_K2 = by_state @ state_covariance_K2 @ by_state.T + np.diag(process_K2)
+    noise_K2 = model.noise_vector_K() ** 2 * min(sampling_s / ahead_s, 1.0)
+    gain = np.linalg.solve(read @ predicted_K2 @ read.T + np.diag(noise_K2), read @ predicted_K2).T
+    kept = np.eye(n_nodes) - gain @ read
+    found, carried = kept @ by_parameter, kept @ by_state
+    for _ in range(DOUBLINGS):
+        found = found + carried @ found
+        carried = carried @ carried
+    return np.asarray(found)
 
 
 def _rows(block: FloatArray) -> Float32Array:

@@ -89,8 +89,6 @@ class HeldForce:
 
     Attributes
     ----------
-    steps
-        A and B of every step, (n_steps, n_nodes, n_nodes).
     step_s : (n_steps,)
     std_W : (n_nodes,)
         Stationary standard deviation of the heat on each node.
@@ -105,7 +103,6 @@ class HeldForce:
         Of the temperatures before the first sample.
     """
 
-    steps: Steps
     step_s: FloatArray
     std_W: FloatArray
     length_s: float
@@ -122,10 +119,10 @@ class HeldForce:
     def whiten(
         self,
         columns: FloatArray,
+        means: tuple[FloatArray, FloatArray],
         sample_of: IntArray,
         valid: BoolArray,
         grid: Grid | None = None,
-        means: tuple[FloatArray, FloatArray] | None = None,
     ) -> tuple[FloatArray, float]:
         """Return columns of readings in the metric of the model, and ln det of the readings' covariance.
 
@@ -136,16 +133,16 @@ class HeldForce:
         ----------
         columns : (n_samples, n_sensors, n_columns)
             Anything that adds to the readings, away from the model's own mean; NaN where not ``valid``.
+        means : (n_kinds, n_nodes, n_nodes) each
+            Of A and of B, d end / d start and d end / d heat, over each kind of step.
         sample_of : (n_steps + 1,)
             Sample at each point of the grid, -1 where there is none.
         valid : (n_samples, n_sensors)
         grid
             How the steps repeat, where it is known already.
-        means
-            Of A and of B over each kind of step, where they are known already.
         """
         grid = grid or grid_of(self.step_s, sample_of, valid)
-        transition, response = means or grid.means_of(self.steps)
+        transition, response = means
         parts, log_det = [], 0.0
         for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
             some = columns[:, :, first : first + COLUMNS_AT_ONCE]
@@ -167,12 +164,12 @@ class HeldForce:
             parts.append(whitened)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2), log_det
 
-    def linear_model(self, drift_K: FloatArray, prior_mean_K: FloatArray) -> LinearModel:
-        """Return the same model for filter and smoother, with b (n_steps, n_nodes) and a mean of the start (n_nodes,)."""
+    def linear_model(self, steps: Steps, drift_K: FloatArray, prior_mean_K: FloatArray) -> LinearModel:
+        """Return the same model for filter and smoother, with A, B, b (n_steps, n_nodes) and a mean of the start (n_nodes,)."""
         n_steps, n = drift_K.shape
         own, heat = np.arange(n), np.arange(n, 2 * n)
         transition, process = np.zeros((n_steps, 2 * n, 2 * n)), np.zeros((n_steps, 2 * n, 2 * n))
-        transition[:, :n, :n], transition[:, :n, n:] = self.steps.transition, self.steps.heat_response_K_per_W
+        transition[:, :n, :n], transition[:, :n, n:] = steps.transition, steps.heat_response_K_per_W
         transition[:, heat, heat] = self.decay[:, None]
         process[:, own, own] = self.floor_K2
         process[:, heat, heat] = (1.0 - self.decay**2)[:, None] * self.std_W**2

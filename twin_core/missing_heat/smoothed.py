@@ -12,7 +12,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, is_late, limited
-from twin_core.calibrate.undeclared.model import HeatFit, Nominal, floor_K2
+from twin_core.calibrate.undeclared.model import HeatFit, Nominal, floor_K2, states_of
 from twin_core.discover.judge import Search
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
@@ -268,7 +268,7 @@ def smoothed_force(
     """Return the smoothed forces, their model about the smoothed temperatures, readings, hyperparameters and steps."""
     nominal, network = fit.nominals[-1], fit.network
     view = View.of(nominal.segment.forcing, 2 * len(network.nodes))
-    states = np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])[view.first_step :]
+    states = states_of(nominal)[view.first_step :]
     turnover = view.turnover_W(network, states[1:])
     watched = [network.nodes.index(node) for node in nodes]
     std = fit.undeclared.std_W.copy()

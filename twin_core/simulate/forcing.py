@@ -54,6 +54,19 @@ class Forcing:
         """Number of time steps."""
         return int(self.step_s.size)
 
+    def opening(self, n_steps: int) -> "Forcing":
+        """Return the first steps, with a single sample at their end."""
+        return Forcing(
+            self.epoch_s,
+            self.start_s,
+            self.step_s[:n_steps],
+            self.stage_time_s[:n_steps],
+            np.array([n_steps]),
+            self.boundaries_K[:n_steps],
+            {name: series[:n_steps] for name, series in self.inputs.items()},
+            self.sun_factor[:n_steps],
+        )
+
     def boundaries_flat_K(self, first: int, last: int) -> FloatArray:
         """Return the boundaries at both ends of steps first..last-1, (2 n_steps, n_boundaries): there may be none."""
         return self.boundaries_K[first:last].reshape(2 * (last - first), self.boundaries_K.shape[2])

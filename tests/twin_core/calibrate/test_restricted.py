@@ -2,11 +2,19 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.linalg import null_space
 from scipy.stats import multivariate_normal
 
 from twin_core.calibrate import restricted
-from twin_core.calibrate.restricted import ExpectedNoise, Leftover, expected_noise, restricted_log_likelihood
+from twin_core.calibrate.restricted import (
+    ExpectedNoise,
+    Leftover,
+    expected_noise,
+    no_longer,
+    restricted_log_likelihood,
+)
 from twin_core.gp.noise_model import ResidualNoise, fit
 
 NOISE_K, STEP_S, SPAN_S = 0.1, 60.0, 36e3
@@ -170,3 +178,20 @@ def test_a_misfit_out_of_all_proportion_to_the_noise_is_weighed(smallness: float
     for found in expected_noise(left, no_prior(33), models, SPAN_S):
         assert np.isfinite(found.white_K2)
         assert 0.1 < power_K2_s(found) / power_K2_s(noise(1.0, 2e4)) < 10.0
+
+
+@given(
+    st.lists(st.tuples(st.floats(1e-6, 1e3), st.floats(1.0, 1e7)), min_size=1, max_size=4),
+    st.floats(1.0, 1e6),
+)
+def test_one_misfit_varies_as_much_and_grows_as_fast_as_all(parts: list[tuple[float, float]], span_s: float) -> None:
+    """After a time h that is short it has moved by 2 s^2 h / length."""
+    misfit = ExpectedNoise(0.01, tuple(parts)).misfit
+    assert misfit is not None
+    std_K, length_s = misfit
+    assert std_K**2 == pytest.approx(sum(v for v, _ in parts))
+    assert std_K**2 / length_s == pytest.approx(sum(v / length for v, length in parts))
+    short = no_longer(ResidualNoise(std_K, length_s, 0.1, 0.0), span_s)
+    assert short.length_s <= span_s or short.length_s == length_s
+    assert short.sigma_ou**2 / short.length_s == pytest.approx(std_K**2 / length_s)
+    assert ExpectedNoise(0.01, ()).misfit is None

@@ -138,7 +138,7 @@ def test_smoothed_temperatures_are_free_of_the_fitted_fault() -> None:
         values = problem.network.parameters.updated(named).values
         states = np.full((segment.forcing.n_steps + 1, 1), 290.0)
         nominal = linearise(problem, values, segment, states, np.zeros((segment.forcing.n_steps, 1)))
-        found.append(smoothed_states(problem, latent, nominal)[0])
+        found.append(smoothed_states(problem, values, latent, nominal)[0])
     np.testing.assert_allclose(found[1], found[0], atol=0.05)  # the priors of the first temperature differ by noise
 
 

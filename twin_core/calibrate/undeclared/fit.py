@@ -66,16 +66,14 @@ def _smoothing_pass(
     """Relinearise every segment about its smoothed temperatures and heat."""
     fresh = []
     for nominal in nominals:
-        states, heat, _ = smoothed_states(problem, undeclared, nominal)
+        states, heat, _ = smoothed_states(problem, values, undeclared, nominal)
         fresh.append(linearise(problem, values, nominal.segment, states, heat[:-1], grid=nominal.grid))
     return tuple(fresh)
 
 
 def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> tuple[Nominal, ...]:
     """Linearise every segment at other parameter values about the same temperatures and heat."""
-    return tuple(
-        linearise(problem, values, n.segment, states_of(n), n.extra_W, n.steps.stages_K, n.grid) for n in nominals
-    )
+    return tuple(linearise(problem, values, n.segment, states_of(n), n.extra_W, n.stages_K, n.grid) for n in nominals)
 
 
 def gauss_newton_step(

@@ -48,28 +48,25 @@ class UndeclaredHeat:
 class Nominal:
     """One segment linearised about temperatures close to the measured ones.
 
-    ``reference_K`` and ``offset_K``, (n_samples, n_sensors), are what the linearised model reads without undeclared heat,
-    and what of it are sensor faults.
+    ``means`` are A and B averaged over each kind of step. ``reference_K`` and ``offset_K``, (n_samples, n_sensors), are what the
+    linearised model reads without undeclared heat, and what of it are sensor faults. A search keeps many of them: A and B of
+    every step, by far the most of it, are computed where they are needed.
     """
 
     segment: Segment
     starts_K: FloatArray
     extra_W: FloatArray
-    steps: Steps
+    stages_K: FloatArray
+    means: tuple[FloatArray, FloatArray]
     reference_K: FloatArray
     offset_K: FloatArray
     sample_of: IntArray
     grid: Grid
 
     @cached_property
-    def means(self) -> tuple[FloatArray, FloatArray]:
-        """A and B averaged over each kind of step: the same whatever the size of the undeclared heat."""
-        return self.grid.means_of(self.steps)
-
-    @cached_property
     def is_finite(self) -> bool:
         """Whether the linearisation has not run away."""
-        return bool(np.isfinite(self.reference_K).all() and np.isfinite(self.steps.transition).all())
+        return bool(np.isfinite(self.reference_K).all() and np.isfinite(self.means[0]).all())
 
     @property
     def residual_K(self) -> FloatArray:
@@ -148,7 +145,8 @@ def linearise(
     offset_K = reading_offsets_K(network, values, segment.record.clock_s)
     read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
     grid = grid or grid_of(forcing.step_s, sample_of, segment.valid)
-    return Nominal(segment, states_K[:-1], extra_W, steps, read, offset_K, sample_of, grid)
+    means = grid.means_of(steps)
+    return Nominal(segment, states_K[:-1], extra_W, steps.stages_K, means, read, offset_K, sample_of, grid)
 
 
 def floor_K2(problem: Problem) -> FloatArray:
@@ -159,7 +157,6 @@ def floor_K2(problem: Problem) -> FloatArray:
 def held_force(problem: Problem, undeclared: UndeclaredHeat, nominal: Nominal) -> HeldForce:
     """Return the model of temperatures and undeclared heats of a segment."""
     return HeldForce(
-        steps=nominal.steps,
         step_s=nominal.segment.forcing.step_s,
         std_W=undeclared.std_W,
         length_s=undeclared.length_s,
@@ -175,7 +172,7 @@ def whiten(
 ) -> tuple[FloatArray, float]:
     """Return columns (n_samples, n_sensors, n_columns) in the metric of the readings, and ln det of their covariance."""
     force = held_force(problem, undeclared, nominal)
-    return force.whiten(columns, nominal.sample_of, nominal.segment.valid, nominal.grid, nominal.means)
+    return force.whiten(columns, nominal.means, nominal.sample_of, nominal.segment.valid, nominal.grid)
 
 
 def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]) -> float:
@@ -206,7 +203,7 @@ def parameter_columns(
     residual may follow as one more column.
     """
     network, forcing = problem.network, nominal.segment.forcing
-    path = Rollout(nominal.steps.stages_K, nominal.starts_K[0], True)
+    path = Rollout(nominal.stages_K, nominal.starts_K[0], True)
     still = np.zeros((problem.n_nodes, problem.n_free))
     shape = (forcing.sample_step.size, network.sensor_node.size)
     columns = np.empty((*shape, problem.n_free + with_residual))
@@ -219,12 +216,14 @@ def parameter_columns(
 
 
 def smoothed_states(
-    problem: Problem, undeclared: UndeclaredHeat, nominal: Nominal
+    problem: Problem, values: FloatArray, undeclared: UndeclaredHeat, nominal: Nominal
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return smoothed temperatures (n_steps + 1, n_nodes), undeclared heat (n_steps + 1, n_nodes) and its deviation in W."""
     n, forcing = problem.n_nodes, nominal.segment.forcing
-    drift = _drift_K(nominal.steps, nominal.starts_K, nominal.extra_W)
-    model = held_force(problem, undeclared, nominal).linear_model(drift, nominal.segment.start_prior_K)
+    starts_K, extra_W = nominal.starts_K, nominal.extra_W
+    steps = one_step(problem.network, values, forcing, starts_K, extra_W, near_K=nominal.stages_K)
+    drift = _drift_K(steps, starts_K, extra_W)
+    model = held_force(problem, undeclared, nominal).linear_model(steps, drift, nominal.segment.start_prior_K)
     stretched = np.full((forcing.n_steps + 1, problem.network.sensor_node.size), np.nan)
     stretched[forcing.sample_step] = nominal.segment.measured_K - nominal.offset_K
     smoothed = smooth(model, kalman_filter(model, stretched, keep="states"))
@@ -239,4 +238,4 @@ def _drift_K(steps: Steps, starts_K: FloatArray, extra_W: FloatArray) -> FloatAr
 
 def states_of(nominal: Nominal) -> FloatArray:
     """Return the temperatures at every grid point, (n_steps + 1, n_nodes)."""
-    return np.vstack([nominal.starts_K, nominal.steps.ends_K[-1:]])
+    return np.vstack([nominal.starts_K, nominal.stages_K[-1:, 1]])
