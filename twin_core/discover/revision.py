@@ -14,6 +14,7 @@ from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_MORE,
     OUTDONE,
+    SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     Finding,
     Judged,
@@ -106,6 +107,42 @@ def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
                 replaced = partial(_in_place_of, state, finding, option, needed)
                 if state.attempt(replaced, f"{option.labels} in place of {finding.judged.labels}"):
                     return True
+    return False
+
+
+def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> bool:
+    """Return whether the last finding explains nothing beside a likelier option that was refused for its size alone.
+
+    Both explain the same, then, and the readings speak against the finding: that the other one cannot be told in watts makes
+    it no less likely.
+
+    Parameters
+    ----------
+    state
+        With the finding.
+    refused
+        What was tried beside it, on top of the same model.
+    needed
+        Log Bayes factor that is asked for: by so much the other one must be likelier, and the finding must add beside it.
+    """
+    found = state.findings[-1].judged
+    own = {effect.place for effect in found.effects}
+    likelier = [
+        j
+        for j in refused
+        if j.reason == SIZE_NOT_DETERMINED
+        and worth(j) < worth(found) - needed
+        and own.isdisjoint(effect.place for effect in j.effects)
+    ]
+
+    def gain(option: Judged) -> float:
+        both = try_effects(option.trial, (*option.trial.effects, *found.effects), n_passes=12)
+        return weigh(option.trial, both, 1).log_bayes_factor
+
+    for option in sorted(likelier, key=worth)[:N_EXCHANGED]:
+        added = state.attempt(partial(gain, option), f"{found.labels} beside {option.labels}")
+        if added is not None and added <= needed:
+            return True
     return False
 
 

@@ -22,6 +22,7 @@ from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
     SIZE_NOT_DETERMINED,
+    UNDECIDED,
     Judged,
     Search,
     accept,
@@ -29,7 +30,7 @@ from twin_core.discover.judge import (
     threshold,
     worth,
 )
-from twin_core.discover.revision import exchange, prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import SETTLING_NATS, extend_by_trajectory
@@ -102,6 +103,10 @@ def search(
         if exchange(before, refused, needed):
             state.join(before)
         elif not extended:
+            break
+        elif is_undecided(state, refused, needed):
+            before.rejected.append(replace(state.findings[-1].judged, reason=UNDECIDED))
+            state.join(before)
             break
         complete(state, needed)
         prune(state, needed)

@@ -47,7 +47,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.revision import exchange, prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
@@ -558,6 +558,35 @@ def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
     assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
     assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
     assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
+
+
+@pytest.mark.parametrize(
+    ("nats", "reason", "node", "added", "undecided"),
+    [
+        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", NEEDED, True),
+        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", NEEDED + JUST, False),
+        (30.0 + NEEDED, SIZE_NOT_DETERMINED, "n1", 0.0, False),
+        (90.0, NO_FORESIGHT, "n1", 0.0, False),
+        (90.0, SIZE_NOT_DETERMINED, "n0", 0.0, False),
+    ],
+    ids=["explains all of it", "leaves some of it", "hardly likelier", "predicts nothing", "is the same effect"],
+)
+def test_a_name_that_adds_nothing_to_a_likelier_one_of_unknown_size_is_none(
+    monkeypatch: pytest.MonkeyPatch, nats: float, reason: str, node: str, added: float, undecided: bool
+) -> None:
+    weighed: list[tuple[Trial, Trial]] = []
+
+    def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+        weighed.append((simple, rich))
+        return Evidence(added, 0.0)
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", weigh)
+    found, option = kind_at("constant_heat_load", "n0", 30.0), kind_at("constant_heat_load", node, nats, reason)
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    assert is_undecided(state, [option], NEEDED) == undecided
+    for simple, rich in weighed:
+        assert simple is option.trial and [e.where["node"] for e in rich.effects] == [node, "n0"]
 
 
 @pytest.mark.parametrize(
