@@ -110,22 +110,27 @@ def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> bool:
-    """Return whether the last finding explains nothing beside a likelier option that was refused for its size alone.
+def is_undecided(state: Search, simple: Trial, refused: Sequence[Judged], needed: float) -> bool:
+    """Return whether the last finding explains a part of what a likelier option explains that was refused for its size alone.
 
-    Both explain the same, then, and the readings speak against the finding: that the other one cannot be told in watts makes
-    it no less likely.
+    The readings speak against the finding, then: that the other one cannot be told in watts makes it no less likely. A finding
+    that explains nearly all is another matter: what repeats as an input does, say, stands for anything that the input drives.
 
     Parameters
     ----------
     state
         With the finding.
+    simple
+        The model without it.
     refused
         What was tried beside it, on top of the same model.
     needed
         Log Bayes factor that is asked for: by so much the other one must be likelier, and the finding must add beside it.
     """
     found = state.findings[-1].judged
+    left = mean_excess(state.trial)
+    if mean_excess(simple) - left >= policy.DOMINANCE * left:
+        return False
     own = {effect.place for effect in found.effects}
     likelier = [
         j
