@@ -110,18 +110,16 @@ def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
     return False
 
 
-def is_undecided(state: Search, simple: Trial, refused: Sequence[Judged], needed: float) -> bool:
+def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> bool:
     """Return whether the last finding explains a part of what a likelier option explains that was refused for its size alone.
 
     The readings speak against the finding, then: that the other one cannot be told in watts makes it no less likely. A finding
-    that explains nearly all is another matter: what repeats as an input does, say, stands for anything that the input drives.
+    that explains as much is another matter: what repeats as an input does, say, stands for anything that the input drives.
 
     Parameters
     ----------
     state
         With the finding.
-    simple
-        The model without it.
     refused
         What was tried beside it, on top of the same model.
     needed
@@ -129,14 +127,13 @@ def is_undecided(state: Search, simple: Trial, refused: Sequence[Judged], needed
     """
     found = state.findings[-1].judged
     left = mean_excess(state.trial)
-    if mean_excess(simple) - left >= policy.DOMINANCE * left:
-        return False
     own = {effect.place for effect in found.effects}
     likelier = [
         j
         for j in refused
         if j.reason == SIZE_NOT_DETERMINED
         and worth(j) < worth(found) - needed
+        and policy.DOMINANCE * mean_excess(j.trial) < left
         and own.isdisjoint(effect.place for effect in j.effects)
     ]
 

@@ -104,7 +104,7 @@ def search(
             state.join(before)
         elif not extended:
             break
-        elif is_undecided(state, before.trial, refused, needed):
+        elif is_undecided(state, refused, needed):
             before.rejected.append(replace(state.findings[-1].judged, reason=UNDECIDED))
             state.join(before)
             break

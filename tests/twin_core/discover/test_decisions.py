@@ -563,19 +563,19 @@ def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
 @pytest.mark.parametrize(
     ("nats", "reason", "node", "left", "added", "undecided"),
     [
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 1.0 + JUST, NEEDED, True),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 1.0 + JUST, NEEDED + JUST, False),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 1.0, NEEDED, False),
-        (30.0 + NEEDED, SIZE_NOT_DETERMINED, "n1", 2.0, 0.0, False),
-        (90.0, NO_FORESIGHT, "n1", 2.0, 0.0, False),
-        (90.0, SIZE_NOT_DETERMINED, "n0", 2.0, 0.0, False),
+        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED, True),
+        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED + JUST, False),
+        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0, NEEDED, False),
+        (30.0 + NEEDED, SIZE_NOT_DETERMINED, "n1", 9.0, 0.0, False),
+        (90.0, NO_FORESIGHT, "n1", 9.0, 0.0, False),
+        (90.0, SIZE_NOT_DETERMINED, "n0", 9.0, 0.0, False),
     ],
-    ids=["explains it", "leaves some", "explains a part", "hardly likelier", "predicts nothing", "is the same"],
+    ids=["explains it", "leaves some", "explains no less", "hardly likelier", "predicts nothing", "is the same"],
 )
 def test_a_name_that_adds_nothing_to_a_likelier_one_of_unknown_size_is_none(
     monkeypatch: pytest.MonkeyPatch, nats: float, reason: str, node: str, left: float, added: float, undecided: bool
 ) -> None:
-    """Of 3 noise variances that the model leaves the finding explains a part."""
+    """The other one leaves one noise variance, the finding more."""
     weighed: list[tuple[Trial, Trial]] = []
 
     def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
@@ -585,8 +585,9 @@ def test_a_name_that_adds_nothing_to_a_likelier_one_of_unknown_size_is_none(
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
     monkeypatch.setattr(revision, "weigh", weigh)
     found, option = kind_at("constant_heat_load", "n0", 30.0), kind_at("constant_heat_load", node, nats, reason)
+    option = replace(option, trial=stub(*option.effects, left=1.0))
     state = Search(stub(*found.effects, left=left), stub(), findings=[Finding(found)])
-    assert is_undecided(state, stub(left=3.0), [option], NEEDED) == undecided
+    assert is_undecided(state, [option], NEEDED) == undecided
     for simple, rich in weighed:
         assert simple is option.trial and [e.where["node"] for e in rich.effects] == [node, "n0"]
 
