@@ -93,7 +93,7 @@ class ExpectedNoise:
         if not self.coloured:
             return None
         variance_K2 = sum(v for v, _ in self.coloured)
-        return float(np.sqrt(variance_K2)), variance_K2 / sum(v / length for v, length in self.coloured)
+        return float(np.sqrt(variance_K2)), float(variance_K2 / sum(v / length for v, length in self.coloured))
 
 
 def no_longer(model: ResidualNoise, span_s: float) -> ResidualNoise:

@@ -186,8 +186,8 @@ def test_a_misfit_out_of_all_proportion_to_the_noise_is_weighed(smallness: float
 )
 def test_one_misfit_varies_as_much_and_grows_as_fast_as_all(parts: list[tuple[float, float]], span_s: float) -> None:
     """After a time h that is short it has moved by 2 s^2 h / length."""
-    misfit = ExpectedNoise(0.01, tuple(parts)).misfit
-    assert misfit is not None
+    misfit = ExpectedNoise(0.01, tuple((np.float64(v), np.float64(length)) for v, length in parts)).misfit
+    assert misfit is not None and [type(number) for number in misfit] == [float, float]  # goes into a file of the model
     std_K, length_s = misfit
     assert std_K**2 == pytest.approx(sum(v for v, _ in parts))
     assert std_K**2 / length_s == pytest.approx(sum(v / length for v, length in parts))
