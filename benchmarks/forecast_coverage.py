@@ -2,9 +2,9 @@
 
 Each spacecraft is calibrated on fourteen orbits (healthy), or diagnosed on them (with a hidden effect, which the corrected
 model then carries); then forecasts of three orbits start at moments that neither saw. Forecasts over a twentieth of a flight set
-start in its last 40 %; it is calibrated anew before each of them, on all that came before, as a twin in service is, and once
-on the first 60 %, as if nobody ever did. A 90 % band should hold 85 to 95 % of the readings, and the
-simultaneous band all of one orbit's (of one horizon's) with 90 %. ``python -m benchmarks.forecast_coverage [--spacecraft N]
+start in its last 40 %; it is calibrated anew before each of them, on all that came before, as ``TWIN_CALIBRATE_EVERY_S`` does
+it, and once on the first 60 %. A 90 % band should hold 85 to 95 % of the readings, and the simultaneous band all of one orbit's
+(of one horizon's) with 90 %. ``python -m benchmarks.forecast_coverage [--spacecraft N]
 [--effects none random] [--starts N] [--sets ROOT]`` writes ``benchmarks/tables/forecast_coverage.md``; without
 spacecraft (``--spacecraft 0``) the flight sets have a table of their own, ``forecast_coverage_flight.md``.
 

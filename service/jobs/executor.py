@@ -5,7 +5,6 @@ it. Here a task that crashes, hangs or is cancelled harms nobody else.
 """
 
 import contextlib
-import ctypes
 import importlib
 import math
 import multiprocessing
@@ -24,18 +23,16 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import Any, Generic, TypeVar
 
+from service.memory import give_back, keep_freed
 from twin_core._typing import Progress, no_progress
 from twin_core.errors import TwinError
 
 T = TypeVar("T")
 
-_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
-"""Gives freed memory back to the system: the GNU allocator keeps what lies between arrays that are still in use."""
-_CHOOSE = getattr(ctypes.CDLL(None), "mallopt", None)
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-"""Names of settings in its malloc.h."""
 APART_BYTES = 16 * 2**20
-"""What a job frees of this size goes back at once. By itself the allocator keeps ever larger pieces, up to 32 MB."""
+"""What a job frees of this size goes back to the system at once; by itself the allocator keeps ever larger pieces, up to 32 MB.
+The diagnosis of 20,833 samples of 12 sensors takes 745 MiB with it, 827 with a quarter of it, 1,054 without.
+"""
 
 END_GRACE_S = 2.0
 POLL_S = 0.2
@@ -219,15 +216,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-def keep_freed(apart_bytes: int, kept_bytes: int | None = None) -> None:
-    """Let this process give back pieces of ``apart_bytes`` as they are freed, and keep ``kept_bytes`` of smaller ones."""
-    if _CHOOSE is None:
-        return
-    _CHOOSE(M_MMAP_THRESHOLD, apart_bytes)
-    if kept_bytes is not None:
-        _CHOOSE(M_TRIM_THRESHOLD, kept_bytes)
-
-
 def _run(connection: Connection, name: str, args: tuple[Any, ...]) -> None:
     """Do the task: the whole life of a worker process."""
     prepare_worker()
@@ -239,8 +227,7 @@ def _run(connection: Connection, name: str, args: tuple[Any, ...]) -> None:
         function = getattr(function, part)
 
     def progress(fraction: float, message: str) -> None:
-        if _TRIM is not None:
-            _TRIM(0)
+        give_back()
         connection.send(("progress", float(fraction), str(message)))
 
     answer: tuple[Any, ...]

@@ -9,8 +9,9 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import ParamSpec, TypeVar
 
 from service.errors import Refusal
-from service.jobs.executor import keep_freed, prepare_worker
+from service.jobs.executor import prepare_worker
 from service.live.batches import Batches
+from service.memory import keep_freed
 from service.workbench.interface import (
     Filtered,
     Forecasted,

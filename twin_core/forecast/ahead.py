@@ -12,7 +12,7 @@ from twin_core.errors import ModelError
 from twin_core.forecast.assumed import How, Inputs, assume, future_record, own_times_s
 from twin_core.forecast.bands import mixture_quantiles, whole_path_factor
 from twin_core.forecast.past import Missed, deviations_K, missed
-from twin_core.forecast.spread import spread
+from twin_core.forecast.spread import Spread, spread
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.simulate.extrapolation import extrapolations, in_words
 from twin_core.simulate.forcing import build_forcing
@@ -116,39 +116,42 @@ def forecast(
     path = rollout(network, values, present_K, forcing)
     if not path.converged:
         raise ModelError("the heat balance has no solution over the horizon: check the planned inputs")
-    read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
-    read += reading_offsets_K(network, values, future.clock_s)
     wanted = np.flatnonzero(np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:]))
+    read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
+    here = (read + reading_offsets_K(network, values, future.clock_s))[wanted]
     beyond = extrapolations(network, model.effects, forcing, path)
     sampling_s = next((_sampling_s(r) for r in (record, before) if r.time_s.size > 1), step)
     outside = [b for _, b in beyond]
     about = spread(model, network, forcing, path, covariance_K2, future.time_s, wanted, outside, sampling_s)
     found = missed(assumed.rules, now_s, forcing)
-    moved = np.zeros((0, wanted.size, network.sensor_node.size))
+    members_K = np.zeros((0, *here.shape))
     if found is not None:
-        moved = deviations_K(network, values, forcing, path, assumed.rules, found, wanted)
-    std, here = np.sqrt(about.variance_K2), read[wanted]
-    bands = mixture_quantiles({*quantiles, *_BAND}, std, moved)
-    kept = about.kept
-    low, middle, high = (bands[q] for q in _BAND)
-    factor = whole_path_factor(
-        WHOLE,
-        about.paths_K,
-        moved[:, kept],
-        model.noise_vector_K(),
-        wanted.size / kept.size,
-        (low[kept], middle[kept], high[kept]),
-    )
-    whole = here + middle - factor * (middle - low), here + middle + factor * (high - middle)
-    mean = here + moved.mean(axis=0) if moved.shape[0] else here
+        members_K = deviations_K(network, values, forcing, path, assumed.rules, found, wanted)
+    bands = mixture_quantiles({*quantiles, *_BAND}, np.sqrt(about.variance_K2), members_K)
+    low, high = _whole(about, members_K, bands, model.noise_vector_K())
+    mean = here + members_K.mean(axis=0) if found is not None else here
     short = () if found is None else _short(found, horizon_s)
     notices = (*orbit_notices(model.spec, [future]), *assumed.in_words(), *short, *in_words(beyond))
     made = {q: here + bands[q] for q in quantiles}
-    return Forecast(future.time_s[wanted], model.spec.sensors, mean, made, whole, assumed.how, notices)
+    return Forecast(
+        future.time_s[wanted], model.spec.sensors, mean, made, (here + low, here + high), assumed.how, notices
+    )
 
 
 _BAND = (round(0.5 - 0.5 * WHOLE, 9), 0.5, round(0.5 + 0.5 * WHOLE, 9))
 """The quantiles that are widened to the simultaneous band."""
+
+
+def _whole(
+    about: Spread, members_K: FloatArray, bands: Mapping[float, FloatArray], noise_K: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return low and high, (n_times, n_sensors) each, about the rollout: a sensor's whole path stays inside with ``WHOLE``."""
+    kept = about.kept
+    low, middle, high = (bands[q] for q in _BAND)
+    at_kept = low[kept], middle[kept], high[kept]
+    n_between = low.shape[0] / kept.size
+    factor = whole_path_factor(WHOLE, about.paths_K, members_K[:, kept], noise_K, n_between, at_kept)
+    return middle - factor * (middle - low), middle + factor * (high - middle)
 
 
 def _up_to(past: Record, now_s: float) -> Record:

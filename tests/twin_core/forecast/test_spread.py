@@ -8,7 +8,7 @@ import pytest
 from tests.helpers import conductive_spec, model_of, record_of
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.forecast.spread import misled
+from twin_core.forecast.spread import state_by_parameters
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
@@ -34,7 +34,7 @@ def model(sensed: bool, misfit_K: float) -> CalibratedModel:
 
 
 def record(made: CalibratedModel, n_samples: int) -> Record:
-    """A steady state, as no sensor's noise blurs it: 284 K at the second node with 6 W to the room."""
+    """A steady state, without noise: 288 K at the second node with 12 W to the room, 292 K at the first."""
     second = 280.0 + HEAT_W / NAMED["G:n1|room"]
     first = second + HEAT_W / NAMED["G:n0|n1"]
     sensed = {"T1": np.full(n_samples, second)} if len(made.spec.sensors) > 1 else {}
@@ -52,7 +52,7 @@ def test_the_filter_follows_readings_in_spite_of_a_parameter(sensed: bool, misfi
     network = made.network()
     ahead = build_forcing(network, record(made, 20), made.max_step_s)
     path = rollout(network, network.parameters.values, done.mean_K, ahead)
-    found = misled(made, network, ahead, path, done.covariance_K2, STEP_S)
+    found = state_by_parameters(made, network, ahead, path, done.covariance_K2, STEP_S)
 
     assert found.shape == (2, len(made.free_names))
     change = 1e-4  # of the logarithm
@@ -75,5 +75,5 @@ def test_steps_longer_than_the_sampling_take_readings_together() -> None:
         driven = record_of(step_s * np.arange(3), T0=np.full(3, 290.0), Q=np.full(3, HEAT_W))
         ahead = build_forcing(network, driven, step_s)
         path = rollout(network, network.parameters.values, done.mean_K, ahead)
-        found[step_s] = misled(made, network, ahead, path, done.covariance_K2, STEP_S)
+        found[step_s] = state_by_parameters(made, network, ahead, path, done.covariance_K2, STEP_S)
     np.testing.assert_allclose(found[120.0][1], found[60.0][1], rtol=0.2, atol=1e-9)
