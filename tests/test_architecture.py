@@ -24,7 +24,7 @@ ROOMS = (
 """The rooms of twin_core from left to right: each may use only those before it."""
 
 SERVICE_ROOMS = (
-    *("errors", "instants", "keys", "settings", "schemas", "calls", "client"),
+    *("errors", "instants", "keys", "settings", "memory", "schemas", "calls", "client"),
     *("store", "workbench", "monitoring", "twins"),
     *("stream", "fleet", "jobs", "live", "archive"),
     "running",
