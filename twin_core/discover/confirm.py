@@ -1,6 +1,6 @@
 """Confirmation: a full refit with an effect in place, its evidence, and how it predicts what it was not fitted to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,10 @@ from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
 
 LN_2 = float(np.log(2.0))
+
+SHORTER_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+"""Shares of an effect's amplitude to start from where the whole one is unlikely while the other parameters still stand where
+they did without it."""
 
 CONSIDERABLE = 0.1
 """Nodes whose undeclared heat moves them less than this share of the most moved one say nothing about an effect."""
@@ -186,15 +190,22 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
     names = base.fit.problem.network.parameters.free_names
     before = dict(zip(names, base.fit.free, strict=True))
     own = {p.name for effect in effects for p in effect.parameters()}
-    free = np.array(
-        [
-            value if name in own else before.get(name, value)
-            for name, value in zip(problem.network.parameters.free_names, problem.network.parameters.free, strict=True)
-        ]
-    )
+
+    def start(of: Problem) -> FloatArray:
+        free = zip(of.network.parameters.free_names, of.network.parameters.free, strict=True)
+        return np.array([value if name in own else before.get(name, value) for name, value in free])
+
+    def shorter() -> Iterator[FloatArray]:
+        there = {effect.place for effect in base.effects}
+        for share in SHORTER_SHARES:
+            yield start(extended(base.fit.problem, [e if e.place in there else e.shortened(share) for e in effects]))
+
     layout = problem.network.layout
     touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
-    fit = fit_with_undeclared_heat(problem, free, near=base.fit, n_passes=n_passes, resized=touched if quick else None)
+    resized = touched if quick else None
+    fit = fit_with_undeclared_heat(
+        problem, start(problem), near=base.fit, shorter=shorter(), n_passes=n_passes, resized=resized
+    )
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 

@@ -329,6 +329,11 @@ class Effect(ABC):
         """Return the effect with some of its values replaced (short names)."""
         return replace(self, values={**self.values, **values})
 
+    def shortened(self, share: float) -> Self:
+        """Return the effect with a share of its amplitudes: each that far from the value at which it vanishes."""
+        nulls = {q.name: q.null for q in self.qualities() if q.null is not None}
+        return self.with_values({name: null + share * (self.values[name] - null) for name, null in nulls.items()})
+
     def at_parameters(self, named: Mapping[str, float]) -> Self:
         """Return the effect with the values that a model gives to its full parameter names."""
         prefix = f"{self.label}."
