@@ -54,6 +54,11 @@ class Judged:
         """Return its effects and their places: ``radiation_to_sink(px,space)``."""
         return " with ".join(effect.label for effect in self.effects)
 
+    @property
+    def places(self) -> frozenset[Place]:
+        """Return names and places of its effects as a key."""
+        return frozenset(effect.place for effect in self.effects)
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -196,7 +201,7 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     # What passed before it but explains too little is no alternative to a name that stands.
     less = [j for j in passed if j is not named and (named is not passed[0] or not is_close(j, named))]
     state.rejected += [replace(j, reason=NO_MORE) for j in less]
-    others = [j for j in judged if _places(j) != _places(named) and all(j.effects != r.effects for r in refused + less)]
+    others = [j for j in judged if j.places != named.places and all(j.effects != r.effects for r in refused + less)]
     state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
     state.trial = named.trial
     return True
@@ -251,10 +256,6 @@ def once_each(options: Sequence[Judged]) -> list[Judged]:
     for judged in sorted(options, key=worth):
         best.setdefault(frozenset((effect.place, len(effect.amplitudes)) for effect in judged.effects), judged)
     return list(best.values())
-
-
-def _places(judged: Judged) -> frozenset[object]:
-    return frozenset(effect.place for effect in judged.effects)
 
 
 def simplest_first(judged: Sequence[Judged]) -> list[Judged]:

@@ -45,7 +45,7 @@ def withdraw(state: Search, needed: float) -> None:
             return
         asked: dict[frozenset[object], float] = {}
         for finding in state.findings:
-            places = frozenset(effect.place for effect in finding.effects)
+            places = finding.judged.places
             is_named = not all(effect.fallback for effect in finding.effects)
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
             asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
@@ -77,7 +77,7 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
     Error on what it was not fitted to, after over before, is enough below ``foresight`` too.
     """
     without = _attempted_without(state, places)
-    finding = next(f for f in state.findings if {effect.place for effect in f.effects} == places)
+    finding = next(f for f in state.findings if f.judged.places == places)
     if without is None:
         return
     option = replace(finding.judged, trial=state.trial)
@@ -152,7 +152,7 @@ def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> boo
 
 def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float) -> bool:
     """Take an option instead of a finding, if it is likelier by the odds asked for and passes; return whether it did."""
-    places = {effect.place for effect in finding.effects}
+    places = finding.judged.places
     kept = _attempted_without(state, places)
     if kept is None:
         return False
@@ -179,7 +179,7 @@ def prune(state: Search, needed: float) -> None:
     as the set has shown its foresight, no more is asked than that the rest predicts no worse.
     """
     for finding in list(state.findings):
-        rest = {effect.place for effect in finding.effects}
+        rest = set(finding.judged.places)
         for effect in finding.effects:
             if all(other.place == effect.place for other in state.trial.effects):
                 continue
@@ -234,7 +234,7 @@ def _is_better(name: Finding, heat: Finding) -> bool:
 def tell_alternatives(state: Search, needed: float) -> None:
     """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more."""
     for i, finding in enumerate(state.findings):
-        kept = _attempted_without(state, {effect.place for effect in finding.effects})
+        kept = _attempted_without(state, finding.judged.places)
         if kept is None:
             continue
         compared = state.attempt(

@@ -146,7 +146,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         state.join(by_heat)
         return bool(told)
     beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
-    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback, beside=beside)
+    known = by_heat.findings[-1].judged.places if told else ()
+    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback, beside=beside, known=known)
     seen = state.attempt(second, f"{what}, by open-loop residuals")
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
     refused = [*by_trajectory.rejected, *by_heat.rejected[len(state.rejected) :]]
@@ -154,8 +155,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         state.rejected = refused
         return False
     state.join(min(options, key=lambda fork: fork.findings[-1].foresight))
-    named = {effect.place for effect in state.findings[-1].effects}
-    state.rejected = [j for j in refused if {effect.place for effect in j.effects} != named]
+    state.rejected = [j for j in refused if j.places != state.findings[-1].judged.places]
     return True
 
 

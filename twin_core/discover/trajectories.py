@@ -5,7 +5,7 @@ that wanders at the sensors.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import comb
@@ -17,9 +17,9 @@ from twin_core.discover.confirm import (
     try_on_trajectories,
     weigh,
 )
-from twin_core.discover.judge import Judged, Search, accept, once_each
+from twin_core.discover.judge import Judged, Search, accept, once_each, worth
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, Place
 
 N_REFITS = 6
 TOGETHER_MISFIT_SHARE = 3.0
@@ -32,14 +32,16 @@ LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
 
 SETTLING_NATS = 40.0
-"""Options this many nats of log evidence behind after a few passes are not fitted further: a limit of time, not of belief. A pair
+"""Options this many nats of log evidence behind are neither fitted further nor extended: a limit of time, not of belief. A pair
 that is found 201 nats likelier began 11 behind: missed at 0, found at 20, 40 and 80 in about the same time."""
 
 N_KEPT, N_SETTLED = 4, 2
 """Sets of effects that are extended by one more, and that are fitted in the presence of undeclared heat too."""
 
 
-def extend_by_trajectory(state: Search, needed: float, *, fallback: bool, beside: Sequence[Trial] = ()) -> bool:
+def extend_by_trajectory(
+    state: Search, needed: float, *, fallback: bool, beside: Sequence[Trial] = (), known: Collection[Place] = ()
+) -> bool:
     """Add the effect, or the effects that only pay off together, that open-loop residuals suggest; False if none holds.
 
     Parameters
@@ -52,6 +54,8 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool, beside
         Whether to try the effects without a name.
     beside
         Trials that are extended by one more effect too: what may only pay off together with another.
+    known
+        Places of what is supported by what the innovations suggest: where it is the likeliest here too, it is not examined again.
     """
     misfit = state.trial.misfit_share()
     if misfit < LEAST_MISFIT_SHARE:
@@ -63,9 +67,12 @@ def extend_by_trajectory(state: Search, needed: float, *, fallback: bool, beside
         if not sets:
             break
         n_tried = comb(state.n_named, n_together)
-        if accept(state, [*_settled(state, sets[:N_SETTLED], n_tried, needed), *sets], needed):
+        options = [*_settled(state, sets[:N_SETTLED], n_tried, needed), *sets]
+        if min(options, key=worth).places == known:
+            return False
+        if accept(state, options, needed):
             return True
-        seeds = [*(j.trial for j in sets), *beside]
+        seeds = [*(j.trial for j in sets if _may_be_likely(j, needed)), *beside]
     return False
 
 
@@ -99,6 +106,11 @@ def _judged(state: Search, trial: Trial, n_tried: int) -> Judged:
     return Judged(trial.effects[len(state.trial.effects) :], weigh(state.trial, trial, n_tried), trial)
 
 
+def _may_be_likely(judged: Judged, needed: float) -> bool:
+    """Return whether an option is worth a further look."""
+    return judged.evidence.log_bayes_factor > needed - SETTLING_NATS
+
+
 def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: float) -> list[Judged]:
     """Return the options that are or may become likely, with their parameters fitted in the presence of undeclared heat too.
 
@@ -108,6 +120,6 @@ def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: flo
     def settled(judged: Judged) -> Judged:
         return _judged(state, resettled(state.trial, judged.trial), n_tried)
 
-    likely = [j for j in options if j.evidence.log_bayes_factor > needed - SETTLING_NATS]
+    likely = [j for j in options if _may_be_likely(j, needed)]
     done = [state.attempt(partial(settled, j), f"{j.labels} on trajectories") for j in likely]
     return [j for j in done if j is not None]
