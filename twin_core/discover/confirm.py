@@ -1,6 +1,6 @@
 """Confirmation: a full refit with an effect in place, its evidence, and how it predicts what it was not fitted to."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,7 +10,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
-from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat, loss_at_start
 from twin_core.calibrate.undeclared.model import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
@@ -21,9 +21,14 @@ from twin_core.network.model import build_network
 
 LN_2 = float(np.log(2.0))
 
+START_LOSS_NATS = 30.0
+"""Loss of likelihood at the start of a fit above which a second one starts from less of the effect; the fit that ends likelier
+counts. A limit of time, not of belief: of 214 fits from both starts, the second ended likelier in one of 163 with a loss below
+30 nats, in ten of 39 with one of 30 to 1000 nats, in ten of 12 beyond."""
+
 SHORTER_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Shares of an effect's amplitude to start from where the whole one is unlikely while the other parameters still stand where
-they did without it."""
+"""Shares of an effect's amplitude for the second start: the first that loses nothing, or the last. Screening takes an amplitude
+to which the other parameters give way; where a fit starts they have not yet."""
 
 CONSIDERABLE = 0.1
 """Nodes whose undeclared heat moves them less than this share of the most moved one say nothing about an effect."""
@@ -195,17 +200,20 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
         free = zip(of.network.parameters.free_names, of.network.parameters.free, strict=True)
         return np.array([value if name in own else before.get(name, value) for name, value in free])
 
-    def shorter() -> Iterator[FloatArray]:
+    starts = [start(problem)]
+    if loss_at_start(problem, starts[0], base.fit) > START_LOSS_NATS:
         there = {effect.place for effect in base.effects}
         for share in SHORTER_SHARES:
-            yield start(extended(base.fit.problem, [e if e.place in there else e.shortened(share) for e in effects]))
-
+            less = [e if e.place in there else e.shortened(share) for e in effects]
+            shorter = start(extended(base.fit.problem, less))
+            if loss_at_start(problem, shorter, base.fit) <= 0.0:
+                break
+        starts.append(shorter)
     layout = problem.network.layout
     touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
     resized = touched if quick else None
-    fit = fit_with_undeclared_heat(
-        problem, start(problem), near=base.fit, shorter=shorter(), n_passes=n_passes, resized=resized
-    )
+    fits = [fit_with_undeclared_heat(problem, s, near=base.fit, n_passes=n_passes, resized=resized) for s in starts]
+    fit = max(fits, key=lambda f: f.log_posterior)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 

@@ -4,9 +4,8 @@ The parameters follow by generalised least squares on the innovations of a filte
 They stay where the physics is, however much heat the declaration lacks.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 
 import numpy as np
 
@@ -39,11 +38,6 @@ START_SHARES = (1.0, 0.03)
 
 STEP_SHARES = (1.0, 0.3, 0.1)
 """Shares of a step of the parameters that are tried in turn."""
-
-START_LOSS_NATS = 30.0
-"""A start that the telemetry makes this much less likely than the fit nearby is left for a shorter one, in nats. Of 214 fits from
-both starts, 43 with a loss of 3 to 30 nats ended likelier from the whole amplitude in ten and less likely in one; 28 with one
-above 100 nats in one and in sixteen; in between it does not matter (five and four of 23)."""
 
 MOST_REFUSED = 2
 """So many passes in which no step of the parameters helped, and only the undeclared heat is sized on."""
@@ -123,7 +117,6 @@ def fit_with_undeclared_heat(
     free: FloatArray | None = None,
     *,
     near: HeatFit | None = None,
-    shorter: Iterable[FloatArray] = (),
     n_passes: int = 12,
     leashes: Sequence[float] = LEASHES,
     resized: Sequence[int] | None = None,
@@ -139,8 +132,6 @@ def fit_with_undeclared_heat(
         Where to start; the problem's own parameters by default.
     near
         A fit of the same telemetry from which temperatures and undeclared heat start.
-    shorter
-        Further starts, (n_free,) each, that are tried in turn where ``free`` is much less likely than ``near``.
     n_passes
         Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
     leashes
@@ -157,10 +148,11 @@ def fit_with_undeclared_heat(
     """
     parameters = problem.network.parameters
     free = parameters.free.copy() if free is None else free.copy()
-    if near is not None:
-        sizes = new_search(problem.n_nodes, 1.5)
-        return _settle(_likely_start(problem, near, chain([free], shorter)), sizes, n_passes, resized, deadline)
     values = parameters.to_values(free)
+    if near is not None:
+        nominals, undeclared = _carried_over(problem, values, near)
+        sizes = new_search(problem.n_nodes, 1.5)
+        return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, resized, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
@@ -179,6 +171,13 @@ def fit_with_undeclared_heat(
         started.append((fit, sizes))
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
     return _settle(fit, sizes, n_passes, deadline=deadline)
+
+
+def loss_at_start(problem: Problem, free: FloatArray, near: HeatFit) -> float:
+    """Return how much less likely the telemetry is where a fit would start than after the one nearby, in nats."""
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a start too far is as unlikely as can be
+        nominals, undeclared = _carried_over(problem, problem.network.parameters.to_values(free), near)
+        return near.log_likelihood - log_likelihood(problem, undeclared, nominals)
 
 
 def _settle(
@@ -259,24 +258,6 @@ def _improve(
         if better:
             return trial, size, about
     return free, undeclared, tuple(nominals)
-
-
-def _likely_start(problem: Problem, near: HeatFit, starts: Iterable[FloatArray]) -> HeatFit:
-    """Return the first start that is not much less likely than a fit nearby, or the likeliest one.
-
-    An effect's size comes from a linear response in which the other parameters give way; at the start they have not yet.
-    """
-    likeliest, start = -np.inf, None
-    for free in starts:
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a start too far is refused just below
-            nominals, undeclared = _carried_over(problem, problem.network.parameters.to_values(free), near)
-            value = log_likelihood(problem, undeclared, nominals)
-        if start is None or value > likeliest:
-            likeliest, start = value, HeatFit(problem, free, undeclared, nominals, -np.inf)
-        if value >= near.log_likelihood - START_LOSS_NATS:
-            break
-    assert start is not None
-    return start
 
 
 def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], UndeclaredHeat]:
