@@ -32,7 +32,7 @@ LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
 
 SETTLING_NATS = 40.0
-"""Options this many nats of log evidence behind are neither fitted further nor extended: a limit of time, not of belief. A pair
+"""Options this many nats of log evidence behind after a few passes are not fitted further: a limit of time, not of belief. A pair
 that is found 201 nats likelier began 11 behind: missed at 0, found at 20, 40 and 80 in about the same time."""
 
 N_KEPT, N_SETTLED = 4, 2
@@ -72,7 +72,7 @@ def extend_by_trajectory(
             return False
         if accept(state, options, needed):
             return True
-        seeds = [*(j.trial for j in sets if _may_be_likely(j, needed)), *beside]
+        seeds = [*(j.trial for j in sets), *beside]
     return False
 
 
@@ -106,11 +106,6 @@ def _judged(state: Search, trial: Trial, n_tried: int) -> Judged:
     return Judged(trial.effects[len(state.trial.effects) :], weigh(state.trial, trial, n_tried), trial)
 
 
-def _may_be_likely(judged: Judged, needed: float) -> bool:
-    """Return whether an option is worth a further look."""
-    return judged.evidence.log_bayes_factor > needed - SETTLING_NATS
-
-
 def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: float) -> list[Judged]:
     """Return the options that are or may become likely, with their parameters fitted in the presence of undeclared heat too.
 
@@ -120,6 +115,6 @@ def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: flo
     def settled(judged: Judged) -> Judged:
         return _judged(state, resettled(state.trial, judged.trial), n_tried)
 
-    likely = [j for j in options if _may_be_likely(j, needed)]
+    likely = [j for j in options if j.evidence.log_bayes_factor > needed - SETTLING_NATS]
     done = [state.attempt(partial(settled, j), f"{j.labels} on trajectories") for j in likely]
     return [j for j in done if j is not None]
