@@ -12,6 +12,7 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.second_order import fit_network
+from twin_core.discover import confirm
 from twin_core.discover.confirm import Trial, try_effects, validate, weigh
 from twin_core.discover.left_out import N_BLOCKS, blocked_errors
 from twin_core.discover.policy import FORESIGHT
@@ -44,6 +45,22 @@ def record(missing_W: float) -> Record:
 def declared(missing_W: float) -> Trial:
     fit, calibration = fit_network(spec(), [record(missing_W)])
     return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+
+
+def test_an_effect_that_starts_far_too_large_ends_no_less_likely_than_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At no amplitude the richer model is the simpler one; a few passes that only shrink the amplitude do not get there."""
+    base = declared(0.0)
+    vast = REGISTRY["radiative_exchange"]({"nodes": ("n0", "n1")}, {"R_m2": 10.0})
+    assert try_effects(base, [vast]).fit.log_posterior > base.fit.log_posterior - 3.0
+    monkeypatch.setattr(confirm, "START_LOSS_NATS", np.inf)
+    assert try_effects(base, [vast]).fit.log_posterior < base.fit.log_posterior - 30.0
+
+
+def test_a_share_of_an_effect_lies_between_it_and_none() -> None:
+    gain = REGISTRY["input_gain"]({"channel": "Q"}, {"g": 3.0})
+    assert gain.shortened(0.25).values == {"g": 1.5}
+    heater = REGISTRY["constant_heat_load"]({"node": "n0"}, {"Q_W": -4.0})
+    assert heater.shortened(0.25).values == {"Q_W": -1.0}
 
 
 def test_left_out_blocks_are_predicted_as_by_a_refit() -> None:
