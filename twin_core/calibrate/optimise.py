@@ -1,4 +1,8 @@
-"""Levenberg-Marquardt on the normal equations: a second-order solver whose outcome is a value, never silence."""
+"""Levenberg-Marquardt on the normal equations with geodesic acceleration; its outcome is a value, never silence.
+
+Where several parameters together leave the readings nearly as they are, the cost is a narrow curved valley, along which straight
+steps must be short. What a step bends away from its linear response corrects it (Transtrum and Sethna 2012, arXiv 1201.5885).
+"""
 
 from dataclasses import dataclass
 from functools import partial
@@ -10,6 +14,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
 from twin_core.calibrate.containment import NO_DEADLINE, NUMERICAL_FAILURES, check_time, is_late
+from twin_core.calibrate.normal_equations import NormalEquations, normal_equations
 from twin_core.calibrate.problem import Fit, Problem
 
 Status = Literal[
@@ -28,6 +33,21 @@ ADVICE: dict[Status, str] = {
 
 LARGEST_STEP = 2.0
 """Longest move of a logarithmic parameter in one iteration: a factor of e^2."""
+
+LEAST_FALL_NATS = 1e-3
+"""A fall of the cost that is no news, whatever its share: unknowns that differ by so little are a thirtieth of their standard
+deviation apart."""
+
+LEAST_GAIN = 1e-4
+"""Fall of the cost over the one foretold from which a step is taken."""
+
+STRAIGHT = 0.1
+"""Where the cost falls by so little more or less than a quadratic model foretells, a step needs no correction."""
+
+MOST_BENT = 0.75
+"""Length of a correction over that of its step, in units in which every unknown counts alike, up to which it is tried: twice as
+long as the second-order model of a step is trusted in (Transtrum and Sethna 2012, section 3.3). A correction is taken only where
+the cost falls by more."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +106,7 @@ def minimise(
     max_iterations
         Accepted steps at most.
     tolerance
-        Stop when an accepted step lowers the cost by less than this share.
+        Stop when an accepted step lowers the cost by less than this share, or by ``LEAST_FALL_NATS``.
     deadline
         On the clock of ``time.monotonic``: no step is begun afterwards.
 
@@ -103,7 +123,7 @@ def minimise(
     except NUMERICAL_FAILURES:
         return Optimum(x, Fit(np.inf, (), ()), np.eye(x.size), "no_solution", 0)
     try:
-        hessian, gradient = _normal_equations(problem, x, fit)
+        equations = normal_equations(problem, x, fit)
     except NUMERICAL_FAILURES:
         return Optimum(x, fit, np.eye(x.size), "numerical_failure", 0)
     damping, growth = 1e-3, 2.0
@@ -115,27 +135,20 @@ def minimise(
             status = "deadline"
             break
         try:
-            step = bounded_step(
-                partial(_step, damping=damping), hessian, gradient, *problem.step_bounds(x, LARGEST_STEP)
-            )
-            predicted = -(gradient @ step + 0.5 * step @ hessian @ step)
-            trial = problem.solve(x + step, fit)
-            fell = fit.cost - trial.cost
-            gain = fell / max(abs(float(predicted)), 1e-300) if np.isfinite(trial.cost) else -1.0
-            if gain > 1e-4:
-                equations = _normal_equations(problem, x + step, trial)
+            move = _move(problem, x, fit, equations, damping, tolerance)
+            if move.gain > LEAST_GAIN:
+                ahead = normal_equations(problem, x + move.step, move.fit)
         except NUMERICAL_FAILURES:
             status = "numerical_failure"
             break
-        if gain > 1e-4:
-            fall = fell / max(fit.cost, 1e-300)
-            x, fit, iterations = x + step, trial, iterations + 1
-            damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), 2.0
-            hessian, gradient = equations
-            if fall < tolerance:
+        if move.gain > LEAST_GAIN:
+            fall, enough = fit.cost - move.fit.cost, max(tolerance * fit.cost, LEAST_FALL_NATS)
+            x, fit, equations, iterations = x + move.step, move.fit, ahead, iterations + 1
+            damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * min(move.gain, 1.0) - 1.0) ** 3), 2.0
+            if fall < enough:
                 status = "converged"
                 break
-        elif 0.0 <= predicted <= tolerance * fit.cost:
+        elif 0.0 <= move.predicted <= max(tolerance * fit.cost, LEAST_FALL_NATS):
             status = "converged"
             break
         else:
@@ -143,12 +156,40 @@ def minimise(
             if damping > 1e12:
                 status = "stalled"
                 break
-    return Optimum(x, fit, hessian, status, iterations)
+    return Optimum(x, fit, equations.hessian, status, iterations)
 
 
-def _normal_equations(problem: Problem, unknowns: FloatArray, fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Return Hessian and gradient; ArithmeticError where the sensitivities have overflowed."""
-    hessian, gradient = problem.normal_equations(unknowns, fit)
-    if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
-        raise ArithmeticError("the sensitivities are not finite")
-    return hessian, gradient
+@dataclass(frozen=True)
+class _Move:
+    """A step, the model after it, the fall of the cost that a quadratic model foretells, and the true one over it."""
+
+    step: FloatArray
+    fit: Fit
+    predicted: float
+    gain: float
+
+
+def _move(
+    problem: Problem, x: FloatArray, fit: Fit, equations: NormalEquations, damping: float, tolerance: float
+) -> _Move:
+    """Return the damped step from a point, corrected for what it bends where that lowers the cost further."""
+    hessian, gradient = equations.hessian, equations.gradient
+    bounds = problem.step_bounds(x, LARGEST_STEP)
+    step = bounded_step(partial(_step, damping=damping), hessian, gradient, *bounds)
+    predicted = -float(gradient @ step + 0.5 * step @ hessian @ step)
+
+    def moved(by: FloatArray, near: Fit) -> _Move:
+        there = problem.solve(x + by, near)
+        gain = (fit.cost - there.cost) / max(abs(predicted), 1e-300) if np.isfinite(there.cost) else -1.0
+        return _Move(by, there, predicted, gain)
+
+    straight = moved(step, fit)
+    is_straight = abs(straight.gain - 1.0) < STRAIGHT
+    if is_straight or predicted <= tolerance * fit.cost or not (equations.slopes and np.isfinite(straight.fit.cost)):
+        return straight
+    correction = _step(hessian, equations.curvature(fit, straight.fit, step), damping)
+    length = np.sqrt(np.diag(hessian))
+    if not np.linalg.norm(length * correction) < MOST_BENT * np.linalg.norm(length * step):
+        return straight
+    bent = moved(np.clip(step + correction, *bounds), straight.fit)
+    return bent if bent.gain > straight.gain else straight

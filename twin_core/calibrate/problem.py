@@ -193,7 +193,7 @@ class Problem:
     def solve(self, unknowns: FloatArray, near: Fit | None = None) -> Fit:
         """Roll all segments out; ``near`` is the fit from which Newton's method starts.
 
-        Like :meth:`normal_equations` it raises TimeIsUpError where the time of ``containment.limited`` is over.
+        Raises TimeIsUpError where the time of ``containment.limited`` is over.
         """
         values = self.values(unknowns)
         mean, std = self.prior()
@@ -282,28 +282,6 @@ class Problem:
                         parameter = at.parameters[int(index[item])]
                         slope = parameter.transform.slope(parameter.free)
                         block[:, column, position[int(index[item])]] += slope * series[samples]
-
-    def normal_equations(self, unknowns: FloatArray, fit: Fit) -> tuple[FloatArray, FloatArray]:
-        """Return the Gauss-Newton Hessian (n_unknowns, n_unknowns) and the gradient (n_unknowns,) of the cost."""
-        mean, std = self.prior()
-        hessian = np.diag(1.0 / std**2)
-        gradient = (unknowns - mean) / std**2
-        residuals = self.residuals(fit)
-        for i, samples, block in self.jacobian_stretches(unknowns, fit):
-            check_time()  # one evaluation over a long record takes seconds
-            residual = residuals[i][samples]
-            valid = np.isfinite(residual)
-            scaled = np.where(valid, residual, 0.0) / self.noise_K
-            weight = valid / self.noise_K
-            if np.isfinite(self.huber):  # iteratively reweighted least squares
-                shrunk = np.sqrt(np.minimum(1.0, self.huber / np.maximum(np.abs(scaled), 1e-12)))
-                scaled, weight = scaled * shrunk, weight * shrunk
-            block *= weight[:, :, None]
-            rows = block.reshape(-1, block.shape[2])
-            columns = np.r_[0 : self.n_free, self.start_columns(i)]
-            hessian[np.ix_(columns, columns)] += rows.T @ rows
-            gradient[columns] -= rows.T @ scaled.ravel()
-        return hessian, gradient
 
     def with_network(self, network: Network) -> "Problem":
         """Return the same data under another network (its effects may add states)."""

@@ -35,7 +35,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     jacobian = stacked_jacobian(problem, problem.jacobian_blocks(unknowns, calibration.optimum.fit))
     residual = np.concatenate(calibration.residuals) / problem.noise_K
     jacobian = jacobian / problem.noise_K[None, :, None]
-    hessian, _ = problem.normal_equations(unknowns, calibration.optimum.fit)
+    hessian = calibration.optimum.hessian
     told = np.isinf(
         problem.step_bounds(unknowns)[1]
     )  # an instant is told by one block alone, and seldom moves linearly

@@ -5,8 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 from tests.helpers import at_named, conductive_spec, record_of
+from twin_core.calibrate.normal_equations import normal_equations
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
@@ -56,3 +58,79 @@ def test_radiation_beside_a_declared_conductor_is_told_from_any_start(factor: fl
     found = p.network.with_values(p.values(optimum.unknowns)).parameters.as_dict()
     np.testing.assert_allclose(found["radiative_exchange(n0,n1).R_m2"], AREA_M2, rtol=0.05)
     np.testing.assert_allclose(found["G:n0|n1"], G[0], rtol=0.1)
+
+
+def warmed_by_one_step() -> Problem:
+    """Return blocks in a row that one step of power warms by a few kelvin, read to half a millikelvin, in a room that is off.
+
+    Capacities and losses nearly make up for each other here: the cost is a narrow valley, and it is curved.
+    """
+    conductors, capacities = [0.27, 0.15], [1400.0, 800.0, 250.0]
+    losses, power_W, room_K = [0.25, 0.17, 0.09], 10.0, 297.5
+    time_s = 20.0 * np.arange(360)
+
+    def rate(t: float, x: np.ndarray) -> np.ndarray:
+        between = [conductors[0] * (x[1] - x[0]), conductors[1] * (x[2] - x[1])]
+        heat = [power_W + between[0], between[1] - between[0], -between[1]]
+        return (np.array(heat) + np.array(losses) * (room_K - x)) / np.array(capacities)
+
+    start_K = np.full(3, room_K - 0.5)
+    read = solve_ivp(rate, (0.0, time_s[-1]), start_K, t_eval=time_s, rtol=1e-9, atol=1e-9).y.T
+    read = read + np.random.default_rng(5).normal(0.0, 5e-4, read.shape)
+    spec = conductive_spec(
+        3,
+        [(0, 1), (1, 2)],
+        boundaries={"room": {"channel": "room"}},
+        channels={"P": {"kind": "power", "unit": "W"}, "room": {"kind": "temperature", "unit": "K"}},
+        loads=[{"channel": "P", "node": "n0"}],
+    )
+    for i in range(3):
+        spec["conductors"].append({"between": [f"n{i}", "room"], "conductance_W_per_K": {"guess": 0.5}})
+    shifted = REGISTRY["boundary_offset"]({"boundary": "room"}, {"b_K": 0.0})
+    network = build_network(load_spec(spec), [shifted])
+    record = record_of(
+        time_s, P=np.full(360, power_W), room=np.full(360, room_K - 0.5), **{f"T{i}": read[:, i] for i in range(3)}
+    )
+    return build_problem(network, [record], np.full(3, 5e-4))
+
+
+def test_a_curved_valley_is_followed_to_its_end() -> None:
+    """SciPy's trust region, given the same residuals and Jacobian and as many evaluations as it likes, gets no lower."""
+    p = warmed_by_one_step()
+    optimum = minimise(p)
+    mean, std = p.prior()
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([*(-r.ravel() / p.noise_K[0] for r in p.residuals(p.solve(x))), (x - mean) / std])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        (block,) = p.jacobian_blocks(x, p.solve(x))
+        return np.vstack([block.reshape(-1, x.size) / p.noise_K[0], np.diag(1.0 / std)])
+
+    peer = least_squares(
+        residuals, p.start(), jacobian, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=None, max_nfev=3000
+    )
+    assert optimum.status == "converged"
+    assert optimum.fit.cost <= peer.cost + 0.01
+
+
+def test_what_a_step_bends_is_half_the_second_derivative() -> None:
+    p = warmed_by_one_step()
+    x, rng = p.start(), np.random.default_rng(2)
+    step = 3e-3 * rng.normal(size=x.size)
+    here, ahead, behind = p.solve(x), p.solve(x + step), p.solve(x - step)
+    equations = normal_equations(p, x, here)
+    half_K = 0.5 * (ahead.predicted_K[0] + behind.predicted_K[0]) - here.predicted_K[0]
+    (block,) = p.jacobian_blocks(x, here)
+    expected = np.einsum("tsi,ts->i", block / p.noise_K[0] ** 2, half_K)
+    bent = 0.5 * (equations.curvature(here, ahead, step) + equations.curvature(here, behind, -step))
+    np.testing.assert_allclose(bent, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_record_too_long_for_its_derivatives_is_fitted_without_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    p = problem(AREA_M2)
+    monkeypatch.setattr("twin_core.calibrate.normal_equations.MOST_KEPT", 100)
+    assert normal_equations(p, p.start(), p.solve(p.start())).slopes == ()
+    optimum = minimise(p)
+    assert optimum.status == "converged"
+    assert optimum.fit.cost < p.solve(p.start()).cost
