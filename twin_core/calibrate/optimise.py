@@ -35,8 +35,8 @@ LARGEST_STEP = 2.0
 """Longest move of a logarithmic parameter in one iteration: a factor of e^2."""
 
 LEAST_FALL_NATS = 1e-3
-"""A fall of the cost that is no news, whatever its share: unknowns that differ by so little are a thirtieth of their standard
-deviation apart."""
+"""A fall of the cost that is no news, at a misfit as large as the noise: unknowns that differ by so little are a thirtieth of
+their standard deviation apart. A larger misfit makes them as much less certain."""
 
 LEAST_GAIN = 1e-4
 """Fall of the cost over the one foretold from which a step is taken."""
@@ -106,7 +106,7 @@ def minimise(
     max_iterations
         Accepted steps at most.
     tolerance
-        Stop when an accepted step lowers the cost by less than this share, or by ``LEAST_FALL_NATS``.
+        Stop when an accepted step lowers the cost by less than this share, or by what ``LEAST_FALL_NATS`` says.
     deadline
         On the clock of ``time.monotonic``: no step is begun afterwards.
 
@@ -126,6 +126,7 @@ def minimise(
         equations = normal_equations(problem, x, fit)
     except NUMERICAL_FAILURES:
         return Optimum(x, fit, np.eye(x.size), "numerical_failure", 0)
+    n_readings = sum(int(segment.valid.sum()) for segment in problem.segments)
     damping, growth = 1e-3, 2.0
     status: Status = "iteration_limit"
     iterations = 0
@@ -135,20 +136,21 @@ def minimise(
             status = "deadline"
             break
         try:
-            move = _move(problem, x, fit, equations, damping, tolerance)
+            enough = max(tolerance * fit.cost, LEAST_FALL_NATS * max(1.0, 2.0 * fit.cost / n_readings))
+            move = _move(problem, x, fit, equations, damping, enough)
             if move.gain > LEAST_GAIN:
                 ahead = normal_equations(problem, x + move.step, move.fit)
         except NUMERICAL_FAILURES:
             status = "numerical_failure"
             break
         if move.gain > LEAST_GAIN:
-            fall, enough = fit.cost - move.fit.cost, max(tolerance * fit.cost, LEAST_FALL_NATS)
+            fall = fit.cost - move.fit.cost
             x, fit, equations, iterations = x + move.step, move.fit, ahead, iterations + 1
             damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * min(move.gain, 1.0) - 1.0) ** 3), 2.0
             if fall < enough:
                 status = "converged"
                 break
-        elif 0.0 <= move.predicted <= max(tolerance * fit.cost, LEAST_FALL_NATS):
+        elif 0.0 <= move.predicted <= enough:
             status = "converged"
             break
         else:
@@ -170,7 +172,7 @@ class _Move:
 
 
 def _move(
-    problem: Problem, x: FloatArray, fit: Fit, equations: NormalEquations, damping: float, tolerance: float
+    problem: Problem, x: FloatArray, fit: Fit, equations: NormalEquations, damping: float, enough: float
 ) -> _Move:
     """Return the damped step from a point, corrected for what it bends where that lowers the cost further."""
     hessian, gradient = equations.hessian, equations.gradient
@@ -185,7 +187,7 @@ def _move(
 
     straight = moved(step, fit)
     is_straight = abs(straight.gain - 1.0) < STRAIGHT
-    if is_straight or predicted <= tolerance * fit.cost or not (equations.slopes and np.isfinite(straight.fit.cost)):
+    if is_straight or predicted <= enough or not (equations.slopes and np.isfinite(straight.fit.cost)):
         return straight
     correction = _step(hessian, equations.curvature(fit, straight.fit, step), damping)
     length = np.sqrt(np.diag(hessian))

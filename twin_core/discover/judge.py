@@ -25,6 +25,9 @@ T = TypeVar("T")
 N_VALIDATED, N_VALIDATED_FREE = 3, 8
 """Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
 
+Without = tuple[Trial, float]
+"""A trial without some of its effects, and their log Bayes factor."""
+
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
 SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters of the model make up for it"
@@ -109,6 +112,8 @@ class Search:
         Of how many samples of the training record the search looked at one.
     first
         Places of effects that spacecraft of the same design have: they are tried wherever they could matter.
+    without
+        The trial so far, and by places what it is without the effects there, as far as anybody has asked.
     """
 
     trial: Trial
@@ -121,6 +126,7 @@ class Search:
     left_out: list[str] = field(default_factory=list)
     every: int = 1
     first: Collection[Place] = ()
+    without: tuple[Trial, dict[frozenset[object], "Without | None"]] | None = None
 
     @contextmanager
     def until(self, deadline: float) -> Iterator[None]:

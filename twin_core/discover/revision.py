@@ -1,6 +1,8 @@
 """Revision: what is withdrawn, exchanged or told beside what a search has found, once more than it is known."""
 
+import os
 from collections.abc import Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -19,6 +21,7 @@ from twin_core.discover.judge import (
     Finding,
     Judged,
     Search,
+    Without,
     examine,
     foresight_of,
     worth,
@@ -49,7 +52,7 @@ def withdraw(state: Search, needed: float) -> None:
             is_named = not all(effect.fallback for effect in finding.effects)
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
             asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
-        without = {places: _attempted_without(state, places) for places in asked}
+        without = _without_each(state, asked)
         told = {
             places: (mean_excess(kept[0]) - left) / asked[places] if asked[places] > 0.0 else np.inf
             for places, kept in without.items()
@@ -264,15 +267,30 @@ def _lead_with_the_likeliest(state: Search, position: int, needed: float) -> Non
         state.findings[position] = replace(state.findings[position], alternatives=alternatives)
 
 
-def _attempted_without(state: Search, places: Collection[object]) -> tuple[Trial, float] | None:
-    """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed."""
+def _attempted_without(state: Search, places: Collection[object]) -> Without | None:
+    """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed.
 
-    def weighed() -> tuple[Trial, float]:
-        others = [effect for effect in state.trial.effects if effect.place not in places]
+    It is asked for again and again, of the same trial: once is enough.
+    """
+    gone = frozenset(places)
+    if state.without is None or state.without[0] is not state.trial:
+        state.without = state.trial, {}
+    known = state.without[1]
+
+    def weighed() -> Without:
+        others = [effect for effect in state.trial.effects if effect.place not in gone]
         without = try_effects(state.trial, others, n_passes=10) if others else state.base
         return without, weigh(without, state.trial, 1).log_bayes_factor
 
-    return state.attempt(weighed, "the model without " + " and ".join(str(place) for place in places))
+    if gone not in known:
+        known[gone] = state.attempt(weighed, "the model without " + " and ".join(str(place) for place in gone))
+    return known[gone]
+
+
+def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[frozenset[object], Without | None]:
+    """Return the same for several sets of places, side by side."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return dict(zip(sets, pool.map(partial(_attempted_without, state), sets), strict=True))
 
 
 def _drop(state: Search, places: Collection[object], without: Trial, lost: float) -> None:

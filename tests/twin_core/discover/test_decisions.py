@@ -286,6 +286,28 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
+def test_a_model_without_a_finding_is_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pruning and withdrawing ask for the same fits; another trial asks for its own."""
+    fitted: list[tuple[str, ...]] = []
+
+    def refitted(effects: tuple[Effect, ...]) -> Trial:
+        names = tuple(e.where["node"] for e in effects)
+        fitted.append(names)
+        return stub(*effects, left=9.0 * (2 - len(names)))
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(50.0, 1.0))
+    state = Search(stub(load("a"), load("b"), left=0.5), stub(left=18.0))
+    state.findings = [Finding(judged("a", 50.0)), Finding(judged("b", 50.0))]
+    prune(state, NEEDED)
+    withdraw(state, NEEDED)
+    assert [f.effects[0].where["node"] for f in state.findings] == ["a", "b"]
+    assert sorted(fitted) == [("a",), ("b",)]
+    state.trial = stub(load("a"), load("b"), left=0.6)
+    withdraw(state, NEEDED)
+    assert sorted(fitted) == [("a",), ("a",), ("b",), ("b",)]
+
+
 @pytest.mark.parametrize(
     ("nats", "explains", "reason", "foresight", "kept"),
     [
