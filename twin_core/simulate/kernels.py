@@ -30,6 +30,10 @@ LEAST_CONTRACTION = 1e-4
 """One that was better by chance promises no more than this for the next step."""
 
 
+NOT_NEAR = np.zeros((0, 2, 0))
+"""No states are known that are close by."""
+
+
 class Remainder(NamedTuple):
     """What is left of the rates beside A and what is given: f(u) = A u + given + r(u).
 
@@ -94,6 +98,7 @@ def march(
     relays: Relays,
     given: FloatArray,
     starts: FloatArray,
+    near: FloatArray,
     lowest: FloatArray,
     highest: FloatArray,
 ) -> tuple[FloatArray, FloatArray, int]:
@@ -112,6 +117,9 @@ def march(
         Rates that no state changes, at the begin and the end of each step.
     starts : (1, n) or (n_steps, n)
         The initial state, or one for each step: then no step goes on from the one before.
+    near : (n_steps, 2, n)
+        States close by at the begin and the end of each step: how far they move is where the iteration of an end starts from.
+        ``NOT_NEAR`` where none are known: then from how far the step before moved.
     lowest, highest : (n,)
         States are kept within.
 
@@ -143,7 +151,8 @@ def march(
             contraction = 1.0
         out[k, 0] = state
         for i in range(n):
-            ahead[i] = state[i] + guess_share * moved[i]
+            guess = near[k, 1, i] - near[k, 0, i] if near.shape[0] > 0 else guess_share * moved[i]
+            ahead[i] = state[i] + (guess if np.isfinite(guess) else 0.0)
         for r in range(n_relays):
             shares[r] = shares_before(relays, r, state, at_s, kicks[k, r])
         settled = False

@@ -107,7 +107,7 @@ def take_steps(split: Split, stages_K: FloatArray, more: FloatArray | float = 0.
     for _ in range(N_NEWTON):
         left, given = split.remainder(split.beside(stages_K, split.first, split.last), stages, split.first, split.last)
         starts = np.ascontiguousarray(stages[:, 0])
-        solved, kicks, _ = march(step_s, split.modes, left, split.relays, given + more, starts, lowest, highest)
+        solved, kicks, _ = march(step_s, split.modes, left, split.relays, given + more, starts, stages, lowest, highest)
         change = float(np.abs(solved - stages).max(initial=0.0))
         stages = solved
         stages_K = to_temperatures_K(network, values, solved, stages_K, LIMIT_K)

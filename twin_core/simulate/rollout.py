@@ -18,7 +18,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.network.model import Network
 from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import Forcing
-from twin_core.simulate.kernels import march
+from twin_core.simulate.kernels import NOT_NEAR, march
 from twin_core.simulate.splitting import STRETCH, Split, anchor_K, limits
 
 TOLERANCE_K = 1e-7
@@ -107,7 +107,8 @@ def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArra
         left, given = split.remainder(None, out, split.first, split.last)
         low, high = limits(split.network, split.values, LIMIT_K)
         step_s = split.forcing.step_s[split.first : split.last]
-        solved, _, n_solved = march(step_s, split.modes, left, split.relays, given, start_K[None], low, high)
+        guess = NOT_NEAR if near is None else near
+        solved, _, n_solved = march(step_s, split.modes, left, split.relays, given, start_K[None], guess, low, high)
         out[:n_solved] = solved[:n_solved]
         return n_solved
     state, done, stretch, n_pieces = start_K, 0, n_steps, 0
@@ -117,7 +118,7 @@ def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArra
             return done
         last = min(done + stretch, n_steps)
         guess = np.broadcast_to(state, (last - done, 2, state.size)) if near is None else near[done:last]
-        solved = _newton(split, state, split.first + done, split.first + last, guess)
+        solved = _newton(split, state, split.first + done, split.first + last, guess, near is not None)
         n_solved = solved.shape[0]
         if n_solved == 0 and stretch == 1:
             return done
@@ -131,10 +132,11 @@ def _stretch(split: Split, start_K: FloatArray, out: FloatArray, near: FloatArra
     return done
 
 
-def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: FloatArray) -> FloatArray:
+def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: FloatArray, is_near: bool) -> FloatArray:
     """Solve steps first..last-1 together for the enthalpies; return the states of leading steps that have settled.
 
-    A step settles once those before it have: where the method takes long for all, it has not been in vain for the first.
+    ``is_near`` tells whether the guess is a trajectory close by rather than a state that lasts. A step settles once those
+    before it have: where the method takes long for all, it has not been in vain for the first.
     """
     network, values, n_steps = split.network, split.values, last - first
     temperatures = np.clip(guess, *LIMIT_K)
@@ -144,7 +146,8 @@ def _newton(split: Split, start_K: FloatArray, first: int, last: int, guess: Flo
     change_before, settled, n_inside = np.inf, 0, 0
     for iteration in range(N_NEWTON if n_steps > 1 else 2 * N_NEWTON):
         left, given = split.remainder(split.beside(temperatures, first, last), stages, first, last)
-        solved, _, n_inside = march(step_s, split.modes, left, split.relays, given, start[None], lowest, highest)
+        near = stages if is_near or iteration > 0 else NOT_NEAR
+        solved, _, n_inside = march(step_s, split.modes, left, split.relays, given, start[None], near, lowest, highest)
         changes = np.abs(solved - stages).max(axis=(1, 2))
         change = float(changes.max())
         if not np.isfinite(change):

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from twin_core.simulate.derivatives import march_sensitivities, transitions
-from twin_core.simulate.kernels import Remainder, march
+from twin_core.simulate.kernels import NOT_NEAR, Remainder, march
 from twin_core.simulate.modes import Modes, phi
 from twin_core.simulate.relays import N_KICK, NO_RELAYS
 from twin_core.simulate.splitting import entries, modes_of
@@ -75,7 +75,7 @@ def test_march_is_the_exponential_trapezoidal_rule(size: float) -> None:
     slope, capacity = coupling(1)
     step, given, linear, moving, start = problem(2, size)
     modes, a = modes_of(slope, capacity), slope / capacity[:, None]
-    found, _, bad = march(step, modes, remainder(linear, moving), NO_RELAYS, given, start[None], LOW, HIGH)
+    found, _, bad = march(step, modes, remainder(linear, moving), NO_RELAYS, given, start[None], NOT_NEAR, LOW, HIGH)
     assert bad == N_STEPS
     state = start
     for k in range(N_STEPS):
@@ -92,11 +92,28 @@ def test_steps_from_their_own_starts_are_single_steps() -> None:
     step, given, linear, moving, _ = problem(4, 1.0)
     modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-11)
     starts = np.random.default_rng(5).normal(300.0, 20.0, (N_STEPS, N))
-    found, _, _ = march(step, modes, left, NO_RELAYS, given, starts, LOW, HIGH)
+    found, _, _ = march(step, modes, left, NO_RELAYS, given, starts, NOT_NEAR, LOW, HIGH)
     for k in range(N_STEPS):
         alone = left._replace(moving=left.moving[k : k + 1])
-        single, _, _ = march(step[k : k + 1], modes, alone, NO_RELAYS, given[k : k + 1], starts[k : k + 1], LOW, HIGH)
+        single, _, _ = march(
+            step[k : k + 1], modes, alone, NO_RELAYS, given[k : k + 1], starts[k : k + 1], NOT_NEAR, LOW, HIGH
+        )
         np.testing.assert_allclose(found[k], single[0], atol=1e-8)
+
+
+@pytest.mark.parametrize("chained", [True, False])
+@pytest.mark.parametrize("off_K", [0.0, 1e-3, 5.0, np.nan])
+def test_states_close_by_change_where_it_starts_and_not_where_it_ends(off_K: float, chained: bool) -> None:
+    slope, capacity = coupling(3)
+    step, given, linear, moving, start = problem(4, 1.0)
+    modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-11)
+    rng = np.random.default_rng(5)
+    starts = start[None] if chained else rng.normal(300.0, 20.0, (N_STEPS, N))
+    found, _, bad = march(step, modes, left, NO_RELAYS, given, starts, NOT_NEAR, LOW, HIGH)
+    near = found + off_K * rng.normal(size=found.shape)
+    again, _, bad_again = march(step, modes, left, NO_RELAYS, given, starts, near, LOW, HIGH)
+    np.testing.assert_allclose(again, found, rtol=0.0, atol=1e-8)
+    assert bad == bad_again == N_STEPS
 
 
 def test_what_leaves_the_limits_is_told() -> None:
@@ -104,7 +121,9 @@ def test_what_leaves_the_limits_is_told() -> None:
     step, given, linear, moving, start = problem(7, 0.0)
     given[5:] += 1e6
     left = remainder(linear, moving)
-    found, _, bad = march(step, modes_of(slope, capacity), left, NO_RELAYS, given, start[None], LOW, np.full(N, 1e3))
+    found, _, bad = march(
+        step, modes_of(slope, capacity), left, NO_RELAYS, given, start[None], NOT_NEAR, LOW, np.full(N, 1e3)
+    )
     assert bad == 5
     assert np.nanmax(found) <= 1e3
 
@@ -118,7 +137,7 @@ def rolled(x: np.ndarray) -> tuple[np.ndarray, Modes, np.ndarray, Remainder, np.
     step, given, linear, moving, start = problem(9, 1.0)
     given = given + x[2] * np.eye(N)[3]
     modes, left = modes_of(slope, capacity), remainder(linear, moving, -1e-10)
-    path, _, bad = march(step, modes, left, NO_RELAYS, given, (start + x[3] * np.eye(N)[0])[None], LOW, HIGH)
+    path, _, bad = march(step, modes, left, NO_RELAYS, given, (start + x[3] * np.eye(N)[0])[None], NOT_NEAR, LOW, HIGH)
     assert bad == N_STEPS
     return path, modes, slope / capacity[:, None], left, step, given
 
@@ -188,12 +207,12 @@ def test_transitions_are_the_derivative_of_single_steps() -> None:
     starts = np.random.default_rng(12).normal(300.0, 20.0, (N_STEPS, N))
     row, column = np.indices((N, N)).reshape(2, -1)
     forward, response = transitions(step, modes, row, column, left.linear + left.moving, starts, NO_RELAYS, NO_KICKS)
-    base, _, _ = march(step, modes, left, NO_RELAYS, given, starts, LOW, HIGH)
+    base, _, _ = march(step, modes, left, NO_RELAYS, given, starts, NOT_NEAR, LOW, HIGH)
     for node in range(N):
         unit = np.eye(N)[node]
-        moved, _, _ = march(step, modes, left, NO_RELAYS, given, starts + unit, LOW, HIGH)
+        moved, _, _ = march(step, modes, left, NO_RELAYS, given, starts + unit, NOT_NEAR, LOW, HIGH)
         np.testing.assert_allclose(forward[:, :, node], moved[:, 1] - base[:, 1], atol=1e-8)
-        heated, _, _ = march(step, modes, left, NO_RELAYS, given + unit, starts, LOW, HIGH)
+        heated, _, _ = march(step, modes, left, NO_RELAYS, given + unit, starts, NOT_NEAR, LOW, HIGH)
         np.testing.assert_allclose(response[:, :, node], heated[:, 1] - base[:, 1], atol=1e-8 * 60.0)
 
 
@@ -205,5 +224,5 @@ def test_a_stiff_mode_lands_on_its_target() -> None:
     )
     modes = modes_of(np.array([[-1e12]]), np.ones(1))
     given = np.full((1, 2, 1), 7e12)
-    found, _, _ = march(np.ones(1), modes, none, NO_RELAYS, given, np.array([[300.0]]), LOW[:1], HIGH[:1])
+    found, _, _ = march(np.ones(1), modes, none, NO_RELAYS, given, np.array([[300.0]]), NOT_NEAR, LOW[:1], HIGH[:1])
     np.testing.assert_allclose(found[0, 1], 7.0, atol=1e-8)
