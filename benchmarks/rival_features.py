@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Heat, table_basis
 from twin_core.parameters.parameter import Parameter
@@ -67,7 +67,7 @@ class FeatureHeat(Effect):
     reference = "Brunton, Proctor and Kutz, PNAS 2016"
     words = "receives a regressed heat"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return nothing: the weights stay as they were regressed."""
         return ()
 

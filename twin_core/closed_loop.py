@@ -23,7 +23,7 @@ from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
-from twin_core.missing_heat.smoothed import bear_witness, told_by
+from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
@@ -34,7 +34,7 @@ from twin_core.report.plots import build_plots
 from twin_core.telemetry import Record, cut_at_gaps
 
 AFTERWARDS = 0.1
-"""Share of the deadline that the witness may take beyond it."""
+"""Share of the deadline that smoothing the missing heat may take beyond it."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -135,12 +135,12 @@ def close_loop(
         predictions = (declared, predicted)
         report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
         progress(0.93, "drawing")
-        witness = bear_witness(found, deadline=latest)
-        report |= told_by(witness, report)
+        missing = smooth_missing_heat(found, deadline=latest)
+        report |= added_to_report(missing, report)
         report |= told_mistakes(found, report, deadline=latest)
         driven, lost = driven_heat(found, deadline=latest)
         report["notices"] += lost
-        plots = build_plots(found, before, after, held, predictions, report, witness, driven)
+        plots = build_plots(found, before, after, held, predictions, report, missing, driven)
         report["quality"] = quality_json([*records, *holdout_records])
         plots["quality_strip"] = quality_strip([*records, *holdout_records])
         report["provenance"] = provenance(spec, [*records, *holdout_records])

@@ -11,7 +11,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
@@ -63,12 +63,12 @@ class Louver(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 9 (louvers)"
     sentence = "a louver between {node} and {sink} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the effective area of the open louver, and the two blade temperatures as the lower one and a range."""
         return (
-            Quality("R_m2", "m2", null=0.0, positive=True),
-            Quality("T_shut_K", "K", prior_std=20.0, leap=5.0),
-            Quality("T_range_K", "K", positive=True, prior_std=0.7),
+            ParameterSpec("R_m2", "m2", null=0.0, positive=True),
+            ParameterSpec("T_shut_K", "K", prior_std=20.0, step_limit=5.0),
+            ParameterSpec("T_range_K", "K", positive=True, prior_std=0.7),
         )
 
     def addition(self, layout: Layout) -> Addition:

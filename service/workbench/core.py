@@ -326,5 +326,5 @@ def _wire(effect: Any) -> Json:
     from twin_core.effects import effect_to_json
 
     data = effect_to_json(effect)
-    values = {quality.name: effect.presented(quality) for quality in effect.qualities()}
+    values = {spec.name: effect.presented(spec) for spec in effect.parameter_specs()}
     return {"effect": data["effect"], "where": data["where"], "parameters": values}

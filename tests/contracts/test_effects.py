@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from tests.helpers import active_effect, every_term_network, null_effects, points, survey_of
 from twin_core.effects import REGISTRY, Effect, effect_from_json, effect_to_json
-from twin_core.effects.base import Quality, Survey
+from twin_core.effects.base import ParameterSpec, Survey
 from twin_core.network.dynamics import evaluate_balance
 from twin_core.network.model import Layout, Network
 from twin_core.network.surroundings import surround
@@ -157,14 +157,14 @@ def test_it_has_a_sentence_of_its_own_that_names_its_whole_place(kind: type[Effe
 @each_effect
 def test_its_parameters_have_units_that_fit_their_names(kind: type[Effect]) -> None:
     effect = active_effect(kind)
-    qualities: tuple[Quality, ...] = effect.qualities()
-    assert len({q.name for q in qualities}) == len(qualities) == len(effect.parameters())
+    parameter_specs: tuple[ParameterSpec, ...] = effect.parameter_specs()
+    assert len({q.name for q in parameter_specs}) == len(parameter_specs) == len(effect.parameters())
     assert effect.amplitudes, "nothing scales the effect"
-    for quality in qualities:
-        base = quality.name.partition("[")[0]
+    for spec in parameter_specs:
+        base = spec.name.partition("[")[0]
         suffix = next((end for end in UNITS if base.endswith(end)), None)
         if suffix is not None:
-            assert quality.unit == UNITS[suffix], quality.name
+            assert spec.unit == UNITS[suffix], spec.name
     for parameter in effect.parameters():
         assert parameter.name.startswith(f"{effect.label}.")
         assert np.isfinite(parameter.value)
@@ -189,9 +189,9 @@ def test_every_place_can_be_built_and_has_the_declared_keys(kind: type[Effect]) 
 @each_effect
 def test_it_starts_at_null(kind: type[Effect]) -> None:
     for effect in null_effects(kind):
-        qualities = effect.qualities()
+        parameter_specs = effect.parameter_specs()
         for i in effect.amplitudes:
-            assert effect.values[qualities[i].name] == qualities[i].null
+            assert effect.values[parameter_specs[i].name] == parameter_specs[i].null
 
 
 @each_effect
@@ -203,7 +203,7 @@ def test_null_is_exactly_nothing(kind: type[Effect]) -> None:
         heat = declared_heat_W(effect, survey_of(network, smooth_points(network, 20)))
         np.testing.assert_array_equal(heat, 0.0)
         for term in effect.addition(layout_with(effect)).readings:
-            values = np.array([effect.values[q.name] for q in effect.qualities()])
+            values = np.array([effect.values[q.name] for q in effect.parameter_specs()])
             np.testing.assert_array_equal(term.evaluate(np.arange(5.0), values).offset_K, 0.0)
 
 
@@ -316,7 +316,7 @@ def test_its_label_names_it_and_its_place(kind: type[Effect]) -> None:
         for name in (value,) if isinstance(value, str) else value:
             assert name in effect.label
     moved = effect.at_parameters({p.name: 2.0 * p.value for p in effect.parameters()})
-    assert all(moved.values[q.name] == 2.0 * effect.values[q.name] for q in effect.qualities())
+    assert all(moved.values[q.name] == 2.0 * effect.values[q.name] for q in effect.parameter_specs())
     assert moved.place == effect.place
 
 
@@ -325,7 +325,7 @@ def test_a_law_has_no_limits_and_what_was_learned_knows_its_own(kind: type[Effec
     """Far from everything visited: a named effect is silent, the fallback says where it was at home and how unsure it is."""
     effect = active_effect(kind)
     network = every_term_network([effect])
-    carried = effect.learned(np.eye(len(effect.qualities())))
+    carried = effect.learned(np.eye(len(effect.parameter_specs())))
     assert (carried.values, carried.label) == (effect.values, effect.label)
     along = points(network, 9)
     far = carried.beyond(network.layout, replace(along, temperatures_K=along.temperatures_K + 1.0e3))
@@ -345,15 +345,15 @@ def test_a_pair_has_no_order(kind: type[Effect]) -> None:
 @each_effect
 def test_amplitudes_that_are_not_physical_are_refused_or_put_on_their_bound(kind: type[Effect]) -> None:
     effect = null_effects(kind)[0]
-    qualities = [effect.qualities()[i] for i in effect.amplitudes]
-    far = effect.with_amplitudes(np.full(len(qualities), -1.0e6))
-    refused = any(q.positive and not q.null for q in qualities)
+    parameter_specs = [effect.parameter_specs()[i] for i in effect.amplitudes]
+    far = effect.with_amplitudes(np.full(len(parameter_specs), -1.0e6))
+    refused = any(q.positive and not q.null for q in parameter_specs)
     if far is None:
-        assert refused or any(q.upper is not None for q in qualities)
+        assert refused or any(q.upper is not None for q in parameter_specs)
     else:
         assert not refused
-        assert all(q.lower is None or far.values[q.name] == q.lower for q in qualities)
-        assert all(far.values[q.name] > 0.0 for q in qualities if q.positive)
+        assert all(q.lower is None or far.values[q.name] == q.lower for q in parameter_specs)
+        assert all(far.values[q.name] > 0.0 for q in parameter_specs if q.positive)
 
 
 def rows() -> dict[str, str]:
@@ -368,5 +368,5 @@ def test_its_parameters_are_documented(kind: type[Effect]) -> None:
     assert kind.name in rows(), f"{kind.name} has no row in docs/effects.md"
     row = rows()[kind.name]
     effect = active_effect(kind)
-    for name in {q.name.partition("[")[0] for q in effect.qualities()} | set(kind.reported_settings):
+    for name in {q.name.partition("[")[0] for q in effect.parameter_specs()} | set(kind.reported_settings):
         assert f"`{name}`" in row, f"the row of {kind.name} lacks the parameter {name}"

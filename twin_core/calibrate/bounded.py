@@ -1,4 +1,4 @@
-"""Newton steps that neither fall below a bound nor leap beyond what a linearisation can tell."""
+"""Newton steps that neither fall below a bound nor go beyond what a linearisation can tell."""
 
 from collections.abc import Callable
 

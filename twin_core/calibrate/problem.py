@@ -160,16 +160,16 @@ class Problem:
         """Return how far down and up one step may go from a vector of unknowns or free parameters, of its size each.
 
         Logarithmic parameters move by ``longest_log`` at most, each held back on its own: one that has lost its way to
-        nothing asks for a leap of many orders of magnitude, and a step shortened as a whole would move nothing at all.
+        nothing asks for a move of many orders of magnitude, and a step shortened as a whole would move nothing at all.
         """
         parameters = self.network.parameters
-        leap = np.full(unknowns.size, np.inf)
-        leap[: self.n_free] = parameters.leap
-        leap[self.logarithmic] = np.minimum(leap[self.logarithmic], longest_log)
-        lowest = -leap
+        limit = np.full(unknowns.size, np.inf)
+        limit[: self.n_free] = parameters.step_limits
+        limit[self.logarithmic] = np.minimum(limit[self.logarithmic], longest_log)
+        lowest = -limit
         lowest[: self.n_free] = np.maximum(lowest[: self.n_free], parameters.lowest - unknowns[: self.n_free])
-        leap[: self.n_free] = np.minimum(leap[: self.n_free], parameters.highest - unknowns[: self.n_free])
-        return np.minimum(lowest, 0.0), np.maximum(leap, 0.0)
+        limit[: self.n_free] = np.minimum(limit[: self.n_free], parameters.highest - unknowns[: self.n_free])
+        return np.minimum(lowest, 0.0), np.maximum(limit, 0.0)
 
     def start(self) -> FloatArray:
         """Return the unknown vector at the network's present values and the prior initial states."""

@@ -185,8 +185,8 @@ def fit_network(
     optimum = min(optima, key=lambda o: o.fit.cost)
     if fits == [None] or not is_late(deadline):
         progress(0.8, "fitting again in the presence of undeclared heat")
-        free, leashes = optimum.unknowns[: problem.n_free], (np.inf,) * 3
-        again = partial(fit_with_undeclared_heat, problem, free, leashes=leashes, deadline=deadline)
+        free, early_prior_std = optimum.unknowns[: problem.n_free], (np.inf,) * 3
+        again = partial(fit_with_undeclared_heat, problem, free, early_prior_std=early_prior_std, deadline=deadline)
         fits.append(attempted(again, "undeclared heat", failures))
     heat_fits = [f for f in fits if f is not None]
     if not heat_fits:
@@ -359,7 +359,7 @@ def _summary(
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
         stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        for name in (f"{e.label}.{q.name}" for e in effects for q in e.qualities() if q.open_ended):
+        for name in (f"{e.label}.{q.name}" for e in effects for q in e.parameter_specs() if q.open_ended):
             position = network.parameters.free_names.index(name)
             if is_open_ended(problem, optimum, position):
                 stds[position] = network.parameters.prior_std[position]

@@ -45,7 +45,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     probes = best_of_each_place(
         screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
     )
-    gains = {p.effect.place: p.gain for p in probes if len(p.effect.qualities()) <= len(own.qualities())}
+    gains = {p.effect.place: p.gain for p in probes if len(p.effect.parameter_specs()) <= len(own.parameter_specs())}
     near = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
     others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= near]
 

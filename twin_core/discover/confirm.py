@@ -241,7 +241,7 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     """
     calibration = rich.calibration()
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
-    own = fit_with_undeclared_heat(calibration.problem, free, leashes=(np.inf,) * 3)
+    own = fit_with_undeclared_heat(calibration.problem, free, early_prior_std=(np.inf,) * 3)
     along = fit_with_undeclared_heat(calibration.problem, free, near=rich.fit)
     near = try_effects(simple, rich.present_effects, n_passes=15).fit
     fit = max(own, along, near, key=lambda f: f.log_posterior)
@@ -362,7 +362,7 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
-    is_law = all(q.instant is None for effect in rich.effects for q in effect.qualities())
+    is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
     return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
 
 

@@ -27,7 +27,7 @@ def searched(base: Trial) -> tuple[Trial, int]:
     if problem is whole:
         return base, 1
     stride = round(whole.n_samples / problem.n_samples)
-    fit = fit_with_undeclared_heat(problem, base.fit.free, leashes=(np.inf,) * 3)
+    fit = fit_with_undeclared_heat(problem, base.fit.free, early_prior_std=(np.inf,) * 3)
     return Trial((), fit, stride * base.max_step_s, (minimise(problem, unknowns),)), stride
 
 

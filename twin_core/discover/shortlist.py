@@ -73,7 +73,7 @@ def shortlist(
 
 def _start(effect: Effect) -> tuple[object, int, tuple[float, ...]]:
     """Return the place, how many amplitudes the effect has, and the values that shape it without scaling it."""
-    shape = tuple(effect.values[q.name] for q in effect.qualities() if q.null is None)
+    shape = tuple(effect.values[q.name] for q in effect.parameter_specs() if q.null is None)
     return effect.place, len(effect.amplitudes), shape
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.base import read as read_effect
 from twin_core.effects.base import to_json as effect_to_json
 from twin_core.effects.boundary_lag import BoundaryLag
@@ -120,4 +120,13 @@ def effect_from_json(data: Any, position: int = 0) -> Effect:
     return read_effect(REGISTRY[name], data, field)
 
 
-__all__ = ["REGISTRY", "Effect", "Quality", "Survey", "Where", "effect_from_json", "effect_to_json", "load_effects"]
+__all__ = [
+    "REGISTRY",
+    "Effect",
+    "ParameterSpec",
+    "Survey",
+    "Where",
+    "effect_from_json",
+    "effect_to_json",
+    "load_effects",
+]

@@ -29,7 +29,7 @@ LEAST_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Quality:
+class ParameterSpec:
     """One parameter of an effect.
 
     Attributes
@@ -44,7 +44,7 @@ class Quality:
         Weak prior around the starting value, in ln for positive ones, in scales for instants; None = flat.
     lower
         The least value, itself possible; None where there is none or the value is positive anyway.
-    leap
+    step_limit
         How far one step of a solver may take a value of either sign: its slope is told by single events; None where any.
     resolution
         Standard deviation of what no fit to this telemetry can tell: it adds to that of the fit.
@@ -63,7 +63,7 @@ class Quality:
     prior_std: float | None = None
     lower: float | None = None
     instant: Shifted | None = None
-    leap: float | None = None
+    step_limit: float | None = None
     resolution: float = 0.0
     open_ended: bool = False
     upper: float | None = None
@@ -73,8 +73,8 @@ class Quality:
         """How a solver moves it."""
         if self.positive:
             return Log(np.inf if self.upper is None else self.upper)
-        if self.leap is not None:
-            return Shifted(0.0, self.leap)
+        if self.step_limit is not None:
+            return Shifted(0.0, self.step_limit)
         if self.lower is None and self.upper is None:
             return self.instant or Identity()
         return Bounded(-np.inf if self.lower is None else self.lower, np.inf if self.upper is None else self.upper)
@@ -240,7 +240,7 @@ class Effect(ABC):
     """True for an effect that is tried only where no named one is supported."""
 
     @abstractmethod
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the parameters, in order."""
 
     @abstractmethod
@@ -311,19 +311,19 @@ class Effect(ABC):
         """Return the effect's parameters under their full names."""
         return tuple(
             Parameter(f"{self.label}.{q.name}", q.unit, float(self.values[q.name]), q.transform, q.prior_std)
-            for q in self.qualities()
+            for q in self.parameter_specs()
         )
 
-    def presented(self, quality: Quality) -> float | str:
+    def presented(self, spec: ParameterSpec) -> float | str:
         """Return a value as people read it: an instant in the telemetry's own form, to the millisecond where dated."""
-        value = float(self.values[quality.name])
-        is_date = quality.instant is not None and self.settings["dated"]
+        value = float(self.values[spec.name])
+        is_date = spec.instant is not None and self.settings["dated"]
         return format_instant(round(1e3 * value) * 1_000_000) if is_date else value
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
         """Positions of the parameters that scale the effect (those with a null value)."""
-        return tuple(i for i, q in enumerate(self.qualities()) if q.null is not None)
+        return tuple(i for i, q in enumerate(self.parameter_specs()) if q.null is not None)
 
     def with_values(self, values: Mapping[str, float]) -> Self:
         """Return the effect with some of its values replaced (short names)."""
@@ -331,7 +331,7 @@ class Effect(ABC):
 
     def shortened(self, share: float) -> Self:
         """Return the effect with a share of its amplitudes: each that far from the value at which it vanishes."""
-        nulls = {q.name: q.null for q in self.qualities() if q.null is not None}
+        nulls = {q.name: q.null for q in self.parameter_specs() if q.null is not None}
         return self.with_values({name: null + share * (self.values[name] - null) for name, null in nulls.items()})
 
     def at_parameters(self, named: Mapping[str, float]) -> Self:
@@ -341,13 +341,13 @@ class Effect(ABC):
 
     def with_amplitudes(self, amounts: FloatArray) -> Self | None:
         """Return the effect with its amplitudes moved from null by ``amounts``; None if that is not physical."""
-        qualities = self.qualities()
+        parameter_specs = self.parameter_specs()
         moved = {}
         for i, amount in zip(self.amplitudes, amounts, strict=True):
-            value = qualities[i].moved(float(amount))
+            value = parameter_specs[i].moved(float(amount))
             if value is None:
                 return None
-            moved[qualities[i].name] = value
+            moved[parameter_specs[i].name] = value
         return self.with_values(moved)
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
@@ -388,12 +388,14 @@ class Effect(ABC):
 
     def _scaled_by(self, own: Sequence[Parameter]) -> dict[int, int]:
         """Return position among a term's own parameters -> which amplitude it is."""
-        names = [f"{self.label}.{self.qualities()[i].name}" for i in self.amplitudes]
+        names = [f"{self.label}.{self.parameter_specs()[i].name}" for i in self.amplitudes]
         return {i: names.index(p.name) for i, p in enumerate(own) if p.name in names}
 
     def _null_values(self, term: Term | CapacityTerm | ReadingTerm, survey: Survey) -> FloatArray:
         """Return a term's values where the effect vanishes, then those that it borrows from the declared model."""
-        null = {f"{self.label}.{q.name}": self.values[q.name] if q.null is None else q.null for q in self.qualities()}
+        null = {
+            f"{self.label}.{q.name}": self.values[q.name] if q.null is None else q.null for q in self.parameter_specs()
+        }
         return np.array([null[p.name] for p in term.parameters] + [survey.parameters[name] for name in term.borrows])
 
 
@@ -459,7 +461,7 @@ def read(kind: type[Effect], data: Json, field: str) -> Effect:
         require(parts["where"], kind)
         settings = {k: tuple(v) if isinstance(v, list) else v for k, v in parts["settings"].items()}
         effect = kind(dict(parts["where"]), {k: float(v) for k, v in parts["values"].items()}, settings)
-        lacking = [q.name for q in effect.qualities() if q.name not in effect.values]
+        lacking = [q.name for q in effect.parameter_specs() if q.name not in effect.values]
     except ModelError as error:
         raise SpecError(f"{field}: {error}") from error
     except KeyError as error:

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.boundaries import boundary_places, changed_boundary, heat_of_change
 from twin_core.effects.hidden_mass import first_order_lag
 from twin_core.network.model import Addition, ExtraNode, Layout
@@ -62,9 +62,9 @@ class BoundaryLag(Effect):
     reference = "Incropera et al., Fundamentals of Heat and Mass Transfer, 7th ed., ch. 5 (lumped capacitance)"
     sentence = "the temperature of {boundary} lags behind its channel"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the time constant; a lag of zero is none, one far longer than the record is a constant sink."""
-        return (Quality("tau_s", "s", null=0.0, positive=True, prior_std=3.0, open_ended=True),)
+        return (ParameterSpec("tau_s", "s", null=0.0, positive=True, prior_std=3.0, open_ended=True),)
 
     @property
     def _state(self) -> str:

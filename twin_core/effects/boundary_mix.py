@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.boundaries import boundary_places, changed_boundary, heat_of_change
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Sink
@@ -44,11 +44,11 @@ class BoundaryMix(Effect):
     reference = "ECSS-E-HB-31-03A, Thermal analysis handbook (effective sink temperatures)"
     sentence = "the temperature of {boundary} follows its channel only in part"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the share of the channel, and the temperature of the rest, which any value stands for without it."""
         return (
-            Quality("alpha", "", null=1.0, lower=0.0, upper=1.0),
-            Quality("T_w_K", "K", null=self.settings.get("T_ref_K", self.values["T_w_K"]), prior_std=50.0),
+            ParameterSpec("alpha", "", null=1.0, lower=0.0, upper=1.0),
+            ParameterSpec("T_w_K", "K", null=self.settings.get("T_ref_K", self.values["T_w_K"]), prior_std=50.0),
         )
 
     def addition(self, layout: Layout) -> Addition:

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.boundaries import boundary_places, changed_boundary, heat_of_change
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Sink
@@ -38,9 +38,9 @@ class BoundaryOffset(Effect):
     reference = "ECSS-E-HB-31-03A, Thermal analysis handbook (boundary conditions of test correlation)"
     sentence = "the temperature of {boundary} is offset from its declared value"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the offset; a known constant cannot fall below absolute zero."""
-        return (Quality("b_K", "K", null=0.0, prior_std=50.0, lower=self.settings.get("least_K")),)
+        return (ParameterSpec("b_K", "K", null=0.0, prior_std=50.0, lower=self.settings.get("least_K")),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of the boundary."""

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.straight_line import range_of_slope, slope_quality
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Capacity, Entry
@@ -61,7 +61,7 @@ class CapacityTemperature(Effect):
     sentence = "the heat capacity of {node} depends on temperature"
     reported_settings = ("T_ref_K",)
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the relative change of capacity per kelvin."""
         return (slope_quality("kappa_per_K", self.settings),)
 

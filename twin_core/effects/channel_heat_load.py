@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.effects.base import Beyond, Effect, Quality, Survey, Where
+from twin_core.effects.base import Beyond, Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
@@ -55,10 +55,10 @@ class ChannelHeatLoad(Effect):
     sentence = "a heat load on {node} that depends on {channel} was missing"
     reported_settings = ("knots", "states", "across")
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the heat at each knot; what straight lines between knots get wrong adds to its deviation."""
         errors = self._interpolation_error_W()
-        return tuple(Quality(f"values_W[{i}]", "W", null=0.0, resolution=float(e)) for i, e in enumerate(errors))
+        return tuple(ParameterSpec(f"values_W[{i}]", "W", null=0.0, resolution=float(e)) for i, e in enumerate(errors))
 
     @property
     def _is_curve(self) -> bool:
@@ -89,7 +89,7 @@ class ChannelHeatLoad(Effect):
         outside = away > EDGE * (knots[-1] - knots[0])
         if not outside.any():
             return None
-        values = np.array([self.values[q.name] for q in self.qualities()])
+        values = np.array([self.values[q.name] for q in self.parameter_specs()])
         slope = float(np.sqrt(np.mean((np.diff(values) / np.diff(knots)) ** 2)))
         visited = f"{self.where['channel']} {knots[0]:.4g} to {knots[-1]:.4g}"
         return Beyond(layout.node(self.where["node"]), outside, np.where(outside, slope * away, 0.0), visited)

@@ -130,27 +130,27 @@ def _starts(kind: type[Effect]) -> str:
     for effect in starts:
         if not effect.amplitudes:
             raise _Wrong("no parameter has a null value; give the one that scales the effect 'null='")
-        for quality in effect.qualities():
-            if quality.null is not None and effect.values[quality.name] != quality.null:
-                raise _Wrong(f"starts yields {quality.name} = {effect.values[quality.name]:g}, not null")
+        for spec in effect.parameter_specs():
+            if spec.null is not None and effect.values[spec.name] != spec.null:
+                raise _Wrong(f"starts yields {spec.name} = {effect.values[spec.name]:g}, not null")
     layout = every_term_network([starts[0]]).layout
     return f"{len(starts)} at the first place, {len(layout.nodes) - len(layout.declared_nodes)} states of its own"
 
 
 def _parameters(kind: type[Effect]) -> str:
     effect = active_effect(kind)
-    qualities = effect.qualities()
-    if len({q.name for q in qualities}) < len(qualities):
+    parameter_specs = effect.parameter_specs()
+    if len({q.name for q in parameter_specs}) < len(parameter_specs):
         raise _Wrong("two parameters have the same name")
-    for quality in qualities:
-        base = quality.name.partition("[")[0]
+    for spec in parameter_specs:
+        base = spec.name.partition("[")[0]
         suffix = next((end for end in UNITS if base.endswith(end)), None)
-        if suffix is not None and quality.unit != UNITS[suffix]:
-            raise _Wrong(f"{quality.name} says {UNITS[suffix]}, its unit is '{quality.unit}'")
-        wanted = next((end for end, unit in UNITS.items() if unit == quality.unit), None)
-        if suffix is None and wanted is not None and quality.instant is None and not kind.fallback:
-            raise _Wrong(f"{quality.name} is in {quality.unit}; let its name end in {wanted}")
-    return ", ".join(f"{q.name} ({q.unit})" if q.unit else q.name for q in qualities)
+        if suffix is not None and spec.unit != UNITS[suffix]:
+            raise _Wrong(f"{spec.name} says {UNITS[suffix]}, its unit is '{spec.unit}'")
+        wanted = next((end for end, unit in UNITS.items() if unit == spec.unit), None)
+        if suffix is None and wanted is not None and spec.instant is None and not kind.fallback:
+            raise _Wrong(f"{spec.name} is in {spec.unit}; let its name end in {wanted}")
+    return ", ".join(f"{q.name} ({q.unit})" if q.unit else q.name for q in parameter_specs)
 
 
 def _null(kind: type[Effect]) -> str:
@@ -207,7 +207,7 @@ def _amplitude(kind: type[Effect]) -> str:
         expected = _slope_at_null(effect, survey.along, survey.rate_K_per_s, k)
         scale = float(np.abs(expected).max())
         if not np.abs(found - expected).max() <= 10.0 * TOLERANCE * scale + 1e-9:
-            name = effect.qualities()[effect.amplitudes[k]].name
+            name = effect.parameter_specs()[effect.amplitudes[k]].name
             raise _Wrong(f"unit_heats is not the slope of the heat with {name} at null")
     return "the slope at null"
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from twin_core.effects.base import Quality, Where
+from twin_core.effects.base import ParameterSpec, Where
 from twin_core.effects.declared import Changed, conductor_places, declared_conductor
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
@@ -16,7 +16,7 @@ class ConductanceStep(OnsetEffect):
     equation = "q_a = -q_b = f G (T_b - T_a) from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 8 (contact conductance)"
     sentence = "the conductance between {first} and {second} changed during the record"
-    amplitude = Quality("f", "", null=1.0, lower=0.0)
+    amplitude = ParameterSpec("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of the declared conductor."""

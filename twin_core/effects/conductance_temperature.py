@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.declared import conductor_places, declared_conductor
 from twin_core.effects.missing_conductor import PairConductor
 from twin_core.effects.straight_line import range_of_slope, slope_quality
@@ -68,7 +68,7 @@ class ConductanceTemperature(Effect):
     sentence = "the conductance between {first} and {second} depends on temperature"
     reported_settings = ("T_ref_K",)
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the temperature coefficient."""
         return (slope_quality("beta_per_K", self.settings),)
 

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
@@ -36,9 +36,9 @@ class ConstantHeatLoad(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2"
     sentence = "a constant heat load on {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the heat."""
-        return (Quality("Q_W", "W", null=0.0),)
+        return (ParameterSpec("Q_W", "W", null=0.0),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the load."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from twin_core.effects.base import Quality, Where
+from twin_core.effects.base import ParameterSpec, Where
 from twin_core.effects.declared import Changed, declared_radiator, radiator_places
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
@@ -16,7 +16,7 @@ class EmissivityStep(OnsetEffect):
     equation = "q = sigma f epsilon A (T_s^4 - T^4) from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 4 (thermal surface finishes)"
     sentence = "the emissivity of the radiator from {node} to {sink} changed during the record"
-    amplitude = Quality("f", "", null=1.0, lower=0.0)
+    amplitude = ParameterSpec("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of the declared radiator."""

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Quality, Survey, Where
+from twin_core.effects.base import ParameterSpec, Survey, Where
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
@@ -43,11 +43,11 @@ class HeatLoadStep(OnsetEffect):
     equation = "q = Q from time on, to stop if it ends"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2 (dissipation by operating mode)"
     sentence = "a heat load that came on at {node} was missing"
-    amplitude = Quality("Q_W", "W", null=0.0)
+    amplitude = ParameterSpec("Q_W", "W", null=0.0)
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return heat and onset, and the end where there is one."""
-        amplitude, onset = super().qualities()
+        amplitude, onset = super().parameter_specs()
         end = (replace(onset, name="stop"),) if "stop" in self.values else ()
         return (amplitude, onset, *end)
 

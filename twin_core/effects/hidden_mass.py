@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.missing_conductor import PairConductor
 from twin_core.network.model import Addition, ExtraNode, Layout
 
@@ -22,11 +22,11 @@ class HiddenMass(Effect):
     reference = "Paper A, section 2: nodes beyond the sensor locations (n > p)"
     sentence = "a thermal mass behind {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return capacity and conductance; without conductance the mass is not there."""
         return (
-            Quality("C_J_per_K", "J/K", positive=True, prior_std=3.0),
-            Quality("G_W_per_K", "W/K", null=0.0, positive=True),
+            ParameterSpec("C_J_per_K", "J/K", positive=True, prior_std=3.0),
+            ParameterSpec("G_W_per_K", "W/K", null=0.0, positive=True),
         )
 
     @property

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.inputs import correct_channel, driving_channels
 from twin_core.network.model import Addition, Layout
 
@@ -20,9 +20,9 @@ class InputDrift(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 4 (degradation of absorptance)"
     sentence = "the heat of {channel} drifted away from its declared value"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the rate of change."""
-        return (Quality("r_per_s", "1/s", null=0.0),)
+        return (ParameterSpec("r_per_s", "1/s", null=0.0),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Self
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.inputs import correct_channel, driving_channels, gain_is_known
 from twin_core.network.model import Addition, Layout
 
@@ -22,9 +22,9 @@ class InputGain(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
     sentence = "the declared heat of {channel} is off by a constant factor"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the gain; one is null."""
-        return (Quality("g", "", null=1.0, positive=True),)
+        return (ParameterSpec("g", "", null=1.0, positive=True),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""

@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.inputs import correct_channel, driving_channels, gain_is_known
 from twin_core.network.model import Addition, Layout
 
@@ -30,13 +30,13 @@ class InputPowerLaw(Effect):
     sentence = "the heat of {channel} is not proportional to its declared value"
     reported_settings = ("reference",)
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the exponent, one is null, and the value at which what is delivered is what is declared."""
-        exponent = Quality("n", "", null=1.0, positive=True, prior_std=1.0)
+        exponent = ParameterSpec("n", "", null=1.0, positive=True, prior_std=1.0)
         return (
             (exponent,)
             if "reference" in self.settings
-            else (exponent, Quality("reference", "", positive=True, prior_std=1.0))
+            else (exponent, ParameterSpec("reference", "", positive=True, prior_std=1.0))
         )
 
     def addition(self, layout: Layout) -> Addition:

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Quality, Survey, Where
+from twin_core.effects.base import ParameterSpec, Survey, Where
 from twin_core.effects.inputs import correct_channel, driving_channels
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
@@ -21,7 +21,7 @@ class InputStep(OnsetEffect):
     equation = "delivered = f declared from time on"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
     sentence = "the heat of {channel} changed by a constant factor during the record"
-    amplitude = Quality("f", "", null=1.0, lower=0.0)
+    amplitude = ParameterSpec("f", "", null=1.0, lower=0.0)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Capacity, Entry
 from twin_core.parameters.parameter import Parameter
@@ -77,14 +77,14 @@ class LatentHeat(Effect):
     reference = "Bonacina et al., Int. J. Heat Mass Transfer 16 (1973): apparent heat capacity; stepped by its enthalpy"
     sentence = "a phase change in {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the latent heat, where it melts and over what width: within what the record visits, or L is a guess."""
         low_K, high_K = self.settings.get("low_K"), self.settings.get("high_K")
         widest_K = None if low_K is None or high_K is None else WIDEST_SHARE * (high_K - low_K)
         return (
-            Quality("L_J", "J", null=0.0, positive=True),
-            Quality("T_m_K", "K", prior_std=20.0, lower=low_K, upper=high_K),
-            Quality("w_K", "K", positive=True, prior_std=1.0, upper=widest_K),
+            ParameterSpec("L_J", "J", null=0.0, positive=True),
+            ParameterSpec("T_m_K", "K", prior_std=20.0, lower=low_K, upper=high_K),
+            ParameterSpec("w_K", "K", positive=True, prior_std=1.0, upper=widest_K),
         )
 
     def addition(self, layout: Layout) -> Addition:

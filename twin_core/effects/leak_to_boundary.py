@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Self
 
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import BoundaryConductor
 
@@ -18,9 +18,9 @@ class LeakToBoundary(Effect):
     sentence = "a heat leak from {node} to {boundary} was missing"
     driven_by = "difference"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the conductance."""
-        return (Quality("G_W_per_K", "W/K", null=0.0, positive=True),)
+        return (ParameterSpec("G_W_per_K", "W/K", null=0.0, positive=True),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the path."""

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Beyond, Effect, Quality, Survey, Where
+from twin_core.effects.base import Beyond, Effect, ParameterSpec, Survey, Where
 from twin_core.errors import ModelError
 from twin_core.gp.basis import SMALLEST_SCALE_K, Basis
 from twin_core.gp.polynomial import ForcePolynomial
@@ -71,9 +71,9 @@ class LearnedHeatFlow(Effect):
             raise ModelError(f"{self.label}: low_K holds {len(low)} temperatures, where has {', '.join(self.where)}")
         return basis
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the coefficients, in W."""
-        return tuple(Quality(f"coefficients[{k}]", "W", null=0.0) for k in range(len(self.basis.exponents)))
+        return tuple(ParameterSpec(f"coefficients[{k}]", "W", null=0.0) for k in range(len(self.basis.exponents)))
 
     def addition(self, layout: Layout) -> Addition:
         """Return the polynomial."""
@@ -88,7 +88,7 @@ class LearnedHeatFlow(Effect):
         node, boundary = self._place(layout)
         law = ForcePolynomial(
             self.basis,
-            np.array([self.values[q.name] for q in self.qualities()]),
+            np.array([self.values[q.name] for q in self.parameter_specs()]),
             self._covariance(),
             float(self.settings["misfit_W"]),
         )

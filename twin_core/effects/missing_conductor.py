@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat, pair_jacobian
 from twin_core.parameters.parameter import Parameter
@@ -46,9 +46,9 @@ class MissingConductor(Effect):
     sentence = "a conductor between {first} and {second} was missing"
     driven_by = "difference"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the conductance."""
-        return (Quality("G_W_per_K", "W/K", null=0.0, positive=True),)
+        return (ParameterSpec("G_W_per_K", "W/K", null=0.0, positive=True),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the coupling."""

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
@@ -55,11 +55,11 @@ class NonlinearConvection(Effect):
     sentence = "convection from {node} to {boundary} was missing"
     driven_by = "difference"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return coefficient and exponent."""
         return (
-            Quality("k", "W/K^p", null=0.0, positive=True),
-            Quality("p", "", positive=True, prior_std=0.5),
+            ParameterSpec("k", "W/K^p", null=0.0, positive=True),
+            ParameterSpec("p", "", positive=True, prior_std=0.5),
         )
 
     def addition(self, layout: Layout) -> Addition:

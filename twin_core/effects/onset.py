@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.parameters.transforms import Shifted
 
 N_ONSETS = 28
@@ -22,13 +22,15 @@ MARGIN = 0.03
 class OnsetEffect(Effect):
     """An effect that sets in at ``time``; a subclass names its amplitude."""
 
-    amplitude: ClassVar[Quality]
+    amplitude: ClassVar[ParameterSpec]
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the amplitude and the onset, which moves by the spacing of ``starts``; its prior spans the record."""
         clock = Shifted(self.settings["begin_s"], self.settings["span_s"] / N_ONSETS)
         resolution = self.blind_s / np.sqrt(12.0)
-        return self.amplitude, Quality("time", "s", prior_std=float(N_ONSETS), instant=clock, resolution=resolution)
+        return self.amplitude, ParameterSpec(
+            "time", "s", prior_std=float(N_ONSETS), instant=clock, resolution=resolution
+        )
 
     @property
     def blind_s(self) -> float:

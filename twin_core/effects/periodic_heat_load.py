@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
@@ -54,13 +54,13 @@ class PeriodicHeatLoad(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2: orbital heating"
     sentence = "a periodic heat load on {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return mean, both amplitudes and the period, which is no longer than the record that it was found in can tell."""
         return (
-            Quality("Q_W", "W", null=0.0),
-            Quality("A_W", "W", null=0.0),
-            Quality("B_W", "W", null=0.0),
-            Quality("P_s", "s", positive=True, prior_std=1.0, upper=self.settings.get("longest_s")),
+            ParameterSpec("Q_W", "W", null=0.0),
+            ParameterSpec("A_W", "W", null=0.0),
+            ParameterSpec("B_W", "W", null=0.0),
+            ParameterSpec("P_s", "s", positive=True, prior_std=1.0, upper=self.settings.get("longest_s")),
         )
 
     def addition(self, layout: Layout) -> Addition:

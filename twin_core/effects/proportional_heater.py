@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import ProportionalHeat
 
@@ -24,12 +24,12 @@ class ProportionalHeater(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
     sentence = "a proportionally controlled heater on {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return gain, set-point and power limit."""
         return (
-            Quality("k_W_per_K", "W/K", null=0.0, positive=True),
-            Quality("T_set_K", "K"),
-            Quality("Q_W", "W", positive=True, prior_std=3.0, open_ended=True),
+            ParameterSpec("k_W_per_K", "W/K", null=0.0, positive=True),
+            ParameterSpec("T_set_K", "K"),
+            ParameterSpec("Q_W", "W", positive=True, prior_std=3.0, open_ended=True),
         )
 
     def addition(self, layout: Layout) -> Addition:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Self
 
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import SinkRadiation
 
@@ -18,9 +18,9 @@ class RadiationToSink(Effect):
     sentence = "a radiator from {node} to {sink} was missing"
     driven_by = "radiation"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the exchange area R = emissivity * area * view factor."""
-        return (Quality("R_m2", "m2", null=0.0, positive=True),)
+        return (ParameterSpec("R_m2", "m2", null=0.0, positive=True),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the radiation term."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat, pair_jacobian
 from twin_core.parameters.parameter import Parameter
@@ -49,9 +49,9 @@ class RadiativeExchange(Effect):
     sentence = "a radiative coupling between {first} and {second} was missing"
     driven_by = "radiation"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the exchange area."""
-        return (Quality("R_m2", "m2", null=0.0, positive=True),)
+        return (ParameterSpec("R_m2", "m2", null=0.0, positive=True),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the exchange."""

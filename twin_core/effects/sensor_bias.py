@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Quality, Where
+from twin_core.effects.base import ParameterSpec, Where
 from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Reading
@@ -34,7 +34,7 @@ class SensorBias(OnsetEffect):
     equation = "reading = T + b from time on"
     reference = "Gertler, Fault Detection and Diagnosis in Engineering Systems, ch. 3 (additive sensor faults)"
     sentence = "sensor {sensor} has read with an offset since an instant in the record"
-    amplitude = Quality("b_K", "K", null=0.0)
+    amplitude = ParameterSpec("b_K", "K", null=0.0)
 
     @property
     def blind_s(self) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Reading
 from twin_core.parameters.parameter import Parameter
@@ -35,9 +35,9 @@ class SensorDrift(Effect):
     reference = "Gertler, Fault Detection and Diagnosis in Engineering Systems, ch. 3 (additive sensor faults)"
     sentence = "sensor {sensor} drifted"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the rate of the drift."""
-        return (Quality("d_K_per_s", "K/s", null=0.0),)
+        return (ParameterSpec("d_K_per_s", "K/s", null=0.0),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the offset of the sensor."""

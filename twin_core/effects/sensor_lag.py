@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.hidden_mass import first_order_lag
 from twin_core.network.model import Addition, ExtraNode, Layout
 from twin_core.network.terms import Along, Entry, Heat
@@ -43,9 +43,9 @@ class SensorLag(Effect):
     reference = "First-order sensor dynamics; Doebelin, Measurement Systems, 5th ed., ch. 3"
     sentence = "sensor {sensor} lags behind the temperature of its node"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the time constant; a lag of zero is none."""
-        return (Quality("tau_s", "s", null=0.0, positive=True),)
+        return (ParameterSpec("tau_s", "s", null=0.0, positive=True),)
 
     @property
     def _state(self) -> str:

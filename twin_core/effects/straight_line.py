@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Quality
+from twin_core.effects.base import ParameterSpec
 
 
 def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: float = 0.0) -> dict[str, float]:
@@ -27,6 +27,6 @@ def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: f
     return bounds | ({"most_per_K": most / below} if below > 0.0 else {})
 
 
-def slope_quality(name: str, settings: Mapping[str, Any]) -> Quality:
+def slope_quality(name: str, settings: Mapping[str, Any]) -> ParameterSpec:
     """Return the slope of a straight line as a parameter, within its range where a training record tells one."""
-    return Quality(name, "1/K", null=0.0, lower=settings.get("least_per_K"), upper=settings.get("most_per_K"))
+    return ParameterSpec(name, "1/K", null=0.0, lower=settings.get("least_per_K"), upper=settings.get("most_per_K"))

@@ -125,9 +125,10 @@ def active_effect(kind: type[Effect], amount: float = 0.7) -> Effect:
         If it has no place there, or cannot have that amplitude.
     """
     start = null_effects(kind)[0]
-    qualities = [start.qualities()[i] for i in start.amplitudes]
+    parameter_specs = [start.parameter_specs()[i] for i in start.amplitudes]
     rooms = [
-        1.0 if q.upper is None or q.null is None or q.upper <= q.null else min(q.upper - q.null, 1.0) for q in qualities
+        1.0 if q.upper is None or q.null is None or q.upper <= q.null else min(q.upper - q.null, 1.0)
+        for q in parameter_specs
     ]
     moved = start.with_amplitudes(amount * np.array(rooms))
     if moved is None:

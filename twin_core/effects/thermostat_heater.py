@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.effects.base import Effect, Quality, Survey, Where
+from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, ExtraNode, Layout
 from twin_core.network.thermostat import Memory, ThermostatHeat
 from twin_core.parameters.parameter import positive
@@ -19,7 +19,7 @@ OFF_QUANTILES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 0.95)
 LEAST_BAND_K = 0.3
 RATE_QUANTILE = 0.8
 
-LEAP_K = 1.0
+STEP_LIMIT_K = 1.0
 """One step of a solver moves a threshold this far at most: its slope is felt at the switchings alone."""
 
 DELAY_SHARE = 0.002
@@ -35,12 +35,12 @@ class ThermostatHeater(Effect):
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 7"
     sentence = "a thermostatically controlled heater on {node} was missing"
 
-    def qualities(self) -> tuple[Quality, ...]:
+    def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return power and both thresholds."""
         return (
-            Quality("Q_W", "W", null=0.0, positive=True),
-            Quality("T_on_K", "K", prior_std=10.0, leap=LEAP_K),
-            Quality("T_off_K", "K", prior_std=10.0, leap=LEAP_K),
+            ParameterSpec("Q_W", "W", null=0.0, positive=True),
+            ParameterSpec("T_on_K", "K", prior_std=10.0, step_limit=STEP_LIMIT_K),
+            ParameterSpec("T_off_K", "K", prior_std=10.0, step_limit=STEP_LIMIT_K),
         )
 
     @property

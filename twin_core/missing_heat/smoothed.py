@@ -1,4 +1,4 @@
-"""A second, independent witness: the heat that the declared model lacks, as a Gaussian process sees it.
+"""The heat that the declared model lacks, smoothed: a Gaussian process that knows no effect, beside what was found.
 
 The search weighs named effects against each other. The latent force knows none of them: it takes the declared network at
 its fitted parameters and smooths whatever heat must have flowed into the nodes for the readings to be what they are
@@ -30,7 +30,7 @@ from twin_core.network.model import Network
 from twin_core.simulate.forcing import Forcing
 
 MAX_WORK = 2e6
-"""Steps times squared states that are smoothed at most: beyond, the witness takes the end of the record alone."""
+"""Steps times squared states that are smoothed at most: of a longer record, its end."""
 MAX_LINEARISATIONS = 3
 MAX_DEGREE = 4
 MAX_TERMS_WORK = 1e7
@@ -48,7 +48,7 @@ BAND = 2.0
 
 @dataclass(frozen=True)
 class NodeHeat:
-    """What the witness says about one node.
+    """The missing heat at one node.
 
     Attributes
     ----------
@@ -152,7 +152,7 @@ class NodeHeat:
 
 
 @dataclass(frozen=True)
-class Witness:
+class MissingHeat:
     """The nodes of interest, and what could not be told, in words."""
 
     heats: tuple[NodeHeat, ...]
@@ -167,10 +167,10 @@ class Witness:
         return [heat.words() for heat in self.heats]
 
 
-def bear_witness(search: Search, *, deadline: float = NO_DEADLINE) -> Witness:
+def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> MissingHeat:
     """Smooth the missing heat at the nodes of interest of the declared model, over the last training segment.
 
-    Trouble with the numbers is told in the notices, never raised: the finding stands without its witness.
+    Trouble with the numbers is told in the notices, never raised: the finding stands without it.
 
     Parameters
     ----------
@@ -185,7 +185,9 @@ def bear_witness(search: Search, *, deadline: float = NO_DEADLINE) -> Witness:
             check_time()
             force, model, observations, values, view = smoothed_force(search.base.fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
-        return Witness((), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",))
+        return MissingHeat(
+            (), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",)
+        )
     watched = [force.nodes.index(search.base.fit.network.nodes.index(node)) for node in nodes]
     laws, notices = ({}, []) if is_late(deadline) else _laws(model, observations, values, force, watched)
     if view.first_step > 0:
@@ -207,15 +209,15 @@ def bear_witness(search: Search, *, deadline: float = NO_DEADLINE) -> Witness:
         others = {name: states[:, i] for i, name in enumerate(search.base.fit.network.nodes) if i != at}
         follows = followed(time_s, mean, drivers, own_K=states[:, at], others_K=others)
         heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
-    return Witness(tuple(heats), tuple(notices))
+    return MissingHeat(tuple(heats), tuple(notices))
 
 
-def told_by(witness: Witness, report: Json) -> Json:
-    """Return what a witness adds to a report: its figures, its sentences after the words, its notices after the others."""
+def added_to_report(missing: MissingHeat, report: Json) -> Json:
+    """Return what the missing heat adds to a report: its figures, its sentences after the words, its notices after the others."""
     return {
-        "witness": witness.rows(),
-        "words": [*report["words"], *witness.words()],
-        "notices": [*report["notices"], *witness.notices],
+        "missing_heat": missing.rows(),
+        "words": [*report["words"], *missing.words()],
+        "notices": [*report["notices"], *missing.notices],
     }
 
 

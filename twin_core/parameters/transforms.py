@@ -21,7 +21,7 @@ class Transform(Protocol):
         ...
 
     @property
-    def leap(self) -> float:
+    def step_limit(self) -> float:
         """The longest step of the free number in which a linearisation still tells something; infinite for most."""
         ...
 
@@ -44,7 +44,7 @@ class Identity:
 
     lowest: ClassVar[float] = -np.inf
     highest: ClassVar[float] = np.inf
-    leap: ClassVar[float] = np.inf
+    step_limit: ClassVar[float] = np.inf
 
     def to_value(self, free: float) -> float:
         """Return the value itself."""
@@ -71,7 +71,7 @@ class Shifted:
 
     lowest: ClassVar[float] = -np.inf
     highest: ClassVar[float] = np.inf
-    leap: ClassVar[float] = 1.0
+    step_limit: ClassVar[float] = 1.0
 
     def to_value(self, free: float) -> float:
         """Return reference + scale * free."""
@@ -96,7 +96,7 @@ class Bounded:
     lower: float
     upper: float = np.inf
 
-    leap: ClassVar[float] = np.inf
+    step_limit: ClassVar[float] = np.inf
 
     @property
     def lowest(self) -> float:
@@ -128,7 +128,7 @@ class Log:
     upper: float = np.inf
 
     lowest: ClassVar[float] = -np.inf
-    leap: ClassVar[float] = np.inf
+    step_limit: ClassVar[float] = np.inf
 
     @property
     def highest(self) -> float:
@@ -157,7 +157,7 @@ class LogInterval:
 
     lowest: ClassVar[float] = -np.inf
     highest: ClassVar[float] = np.inf
-    leap: ClassVar[float] = np.inf
+    step_limit: ClassVar[float] = np.inf
 
     def _span(self) -> float:
         return float(np.log(self.upper / self.lower))

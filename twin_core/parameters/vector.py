@@ -84,9 +84,9 @@ class ParameterSet:
         return np.array([self.parameters[i].transform.highest for i in self.free_index], dtype=np.float64)
 
     @property
-    def leap(self) -> FloatArray:
+    def step_limits(self) -> FloatArray:
         """Longest steps of the free vector at once, (n_free,); infinite where any will do."""
-        return np.array([self.parameters[i].transform.leap for i in self.free_index], dtype=np.float64)
+        return np.array([self.parameters[i].transform.step_limit for i in self.free_index], dtype=np.float64)
 
     def slope(self, index: int, value: float) -> float:
         """Return d value / d free of one parameter where its physical value is ``value``."""

@@ -31,7 +31,7 @@ def where_json(effect: Effect) -> Json:
 def parameters_json(effect: Effect, stds: dict[str, float]) -> Json:
     """Return mean and standard deviation of an effect's parameters; tables become lists, instants their own form."""
     rows: dict[str, Any] = {}
-    for quality in effect.qualities():
+    for quality in effect.parameter_specs():
         mean = effect.presented(quality)
         std = stds.get(f"{effect.label}.{quality.name}")
         std = None if std is None else quality.spread(std)

@@ -11,7 +11,7 @@ from twin_core.discover.judge import Search
 from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.holdout import HeldOut, Prediction
 from twin_core.missing_heat.driven import thinned
-from twin_core.missing_heat.smoothed import NodeHeat, Witness
+from twin_core.missing_heat.smoothed import MissingHeat, NodeHeat
 from twin_core.report.dossier import histograms, limits
 from twin_core.telemetry import Record
 
@@ -40,7 +40,7 @@ def build_plots(
     held: Sequence[HeldOut],
     predictions: tuple[Sequence[Prediction], Sequence[Prediction]],
     report: Json,
-    witness: Witness,
+    missing: MissingHeat,
     driven: Sequence[Json],
 ) -> Json:
     """Return everything that the page of a report draws.
@@ -51,7 +51,7 @@ def build_plots(
         As in ``report.build_report``.
     report
         The finished report, for its criteria and words.
-    witness
+    missing
         The heat that the declared model lacks.
     driven
         The heat of couplings over what drives it, as ``driven.driven_heat``.
@@ -60,7 +60,7 @@ def build_plots(
     return {
         "dated": first.epoch_ns is not None,
         **_temperatures(search, held, predictions),
-        "missing_heat": [_missing_heat(heat, first) for heat in witness.heats],
+        "missing_heat": [_missing_heat(heat, first) for heat in missing.heats],
         "driven_heat": thinned(driven, MAX_POINTS),
         "histograms": histograms(before.spec, predictions),
         "limits": limits(before.spec, before.noise_K),

@@ -111,7 +111,7 @@ def test_a_deadline_is_told_in_the_report() -> None:
     assert any("the deadline ended the search" in notice for notice in report["notices"])
     assert report["search"] == {"complete": False, "left_out": report["search"]["left_out"], "every": 1}
     assert "deadline ended the search" in headline(report) and "suffices" not in headline(report)
-    assert report["witness"] == [] and any("the time is up" in notice for notice in report["notices"])
+    assert report["missing_heat"] == [] and any("the time is up" in notice for notice in report["notices"])
 
 
 def test_what_began_before_the_deadline_does_not_go_on_after_it(base: Trial, monkeypatch: pytest.MonkeyPatch) -> None:

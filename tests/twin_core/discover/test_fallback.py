@@ -25,7 +25,7 @@ from twin_core.gp.polynomial import ForcePolynomial
 from twin_core.latent_force.declared import fit_declared
 from twin_core.latent_force.posterior import GammaPrior
 from twin_core.latent_force.regression import learn_heat_flow
-from twin_core.missing_heat.smoothed import NodeHeat, bear_witness
+from twin_core.missing_heat.smoothed import NodeHeat, smooth_missing_heat
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
@@ -107,7 +107,7 @@ class Found:
     @property
     def law(self) -> ForcePolynomial:
         """The finding as a polynomial with the covariance that it carries."""
-        weights = np.array([self.effect.values[q.name] for q in self.effect.qualities()])
+        weights = np.array([self.effect.values[q.name] for q in self.effect.parameter_specs()])
         cov = np.reshape(self.effect.settings["covariance_W2"], (weights.size, weights.size))
         return ForcePolynomial(self.effect.basis, weights, cov)
 
@@ -123,7 +123,7 @@ def found(request: pytest.FixtureRequest) -> Found:
         fit, calibration = fit_network(spec, [record])
         base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         state = search(base, false_alarm_rate=0.01, progress=no_progress)
-        (seen,) = bear_witness(state).heats
+        (seen,) = smooth_missing_heat(state).heats
         return Found(world, spec, record, corrected(base, state), seen)
 
 

@@ -250,9 +250,9 @@ def test_a_fit_finds_the_change(truth: Effect) -> None:
 
 
 def test_a_share_may_end_on_its_bound() -> None:
-    quality = MIX.qualities()[0]
-    assert [quality.transform.to_value(x) for x in (-0.5, 0.0, 0.4, 1.0, 1.5)] == [0.0, 0.0, 0.4, 1.0, 1.0]
-    assert (quality.transform.lowest, quality.transform.highest) == (0.0, 1.0)
+    spec = MIX.parameter_specs()[0]
+    assert [spec.transform.to_value(x) for x in (-0.5, 0.0, 0.4, 1.0, 1.5)] == [0.0, 0.0, 0.4, 1.0, 1.0]
+    assert (spec.transform.lowest, spec.transform.highest) == (0.0, 1.0)
 
 
 def test_screening_hears_everything_that_reads_the_boundary() -> None:

@@ -199,7 +199,7 @@ def test_a_change_of_phase_lies_within_what_was_visited() -> None:
     starts = list(REGISTRY["latent_heat"].starts({"node": "a"}, survey))
     assert starts
     for effect in starts:
-        centre, width = (next(q for q in effect.qualities() if q.name == name) for name in ("T_m_K", "w_K"))
+        centre, width = (next(q for q in effect.parameter_specs() if q.name == name) for name in ("T_m_K", "w_K"))
         for far_K in (100.0, 1000.0):
             assert visited_K.min() <= centre.transform.to_value(far_K) <= visited_K.max()
         assert width.transform.to_value(np.log(1000.0)) <= 0.25 * np.ptp(visited_K)

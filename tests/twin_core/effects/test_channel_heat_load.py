@@ -96,11 +96,11 @@ def test_the_error_of_straight_lines_is_that_of_the_best_ones() -> None:
     table = ChannelHeatLoad(
         PLACE, {f"values_W[{i}]": v for i, v in enumerate(values)}, {"knots": tuple(knots), "levels": False}
     )
-    told = np.array([quality.resolution for quality in table.qualities()])
+    told = np.array([spec.resolution for spec in table.parameter_specs()])
     off = np.abs(values - 3.0 * knots**2)
     np.testing.assert_allclose(told[4:-4], off[4:-4], rtol=0.02)
     assert [
-        q.resolution for q in ChannelHeatLoad(PLACE, {}, {"knots": (0.0, 1.0, 2.0), "levels": True}).qualities()
+        q.resolution for q in ChannelHeatLoad(PLACE, {}, {"knots": (0.0, 1.0, 2.0), "levels": True}).parameter_specs()
     ] == [0] * 3
 
 

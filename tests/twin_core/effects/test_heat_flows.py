@@ -200,7 +200,7 @@ def test_learned_heat_flow_answers_to_node_and_boundary(vanishing: bool) -> None
 def test_learned_heat_flow_with_wrong_settings_is_refused(where: dict, change: dict, message: str) -> None:
     effect = REGISTRY["learned_heat_flow"](where, {"coefficients[0]": 0.0}, LEARNED | change)
     with pytest.raises(ModelError, match=message):
-        effect.qualities()
+        effect.parameter_specs()
 
 
 def test_learned_heat_flow_tries_a_boundary_only_where_it_has_moved() -> None:

@@ -47,7 +47,7 @@ def test_what_has_not_come_back_once_is_no_period() -> None:
     starts = list(LOAD.starts({"node": "a"}, replace(survey_of(network, along), residual_K=slow + noise)))
     assert starts
     for effect in starts:
-        period = next(q for q in effect.qualities() if q.name == "P_s")
+        period = next(q for q in effect.parameter_specs() if q.name == "P_s")
         assert effect.values["P_s"] <= span_s / 2.0
         assert period.transform.to_value(np.log(span_s)) == pytest.approx(span_s / 2.0)
         assert period.transform.highest == pytest.approx(np.log(span_s / 2.0))

@@ -69,7 +69,7 @@ WHOLE = PLUGIN.read_text()
         ("raise SystemExit(3)\n", r":1: SystemExit: 3; correct the file"),
         ("x = 1\n", r": defines no effect; write a subclass of twin_core\.effects\.base\.Effect"),
         (BASE, r": defines no effect; write a subclass"),
-        (BASE + "class Mine(Effect):\n    pass\n", r": Mine lacks addition, places, qualities, starts; define"),
+        (BASE + "class Mine(Effect):\n    pass\n", r": Mine lacks addition, parameter_specs, places, starts; define"),
         (WHOLE.replace("    sentence =", "    _ ="), r": Louver has no 'sentence'; set it in the class"),
         (WHOLE.replace('"louver"', '"hidden_mass"'), r": the name 'hidden_mass' is taken, by the vocabulary of docs/"),
         (WHOLE.replace('"R_m2", "m2"', '"R_m2", "W"'), r": effect louver: parameters: R_m2 says m2, its unit is 'W'"),

@@ -107,7 +107,7 @@ def test_the_balance_changes_at_the_onset(effect: Effect, after: tuple[np.ndarra
 def test_a_heat_that_ends_leaves_the_balance_as_it_was() -> None:
     effect = step("heat_load_step", {"node": "n0"}, 12.0)
     ending = replace(effect, values={**effect.values, "stop": 9000.0})
-    assert [q.name for q in ending.qualities()] == ["Q_W", "time", "stop"]
+    assert [q.name for q in ending.parameter_specs()] == ["Q_W", "time", "stop"]
     again = effect_from_json(json.loads(json.dumps(effect_to_json(ending))))
     assert again == ending
     record, start = heated(), np.array([290.0, 285.0])
@@ -249,7 +249,7 @@ def test_a_fit_moves_the_onset_to_its_instant(fitted: CalibratedModel) -> None:
     assert effect.values["f"] == pytest.approx(0.25, abs=0.01)
     told = {p["name"]: p for p in fitted.summary["parameters"]}[f"{effect.label}.time"]
     assert 0.0 < told["std"] < 30.0
-    time = effect.presented(effect.qualities()[1])
+    time = effect.presented(effect.parameter_specs()[1])
     assert isinstance(time, str) and time.startswith("2026-01-01T03:2")
 
 
@@ -296,7 +296,7 @@ def test_an_onset_while_the_input_is_off_lies_in_the_middle(point: float, centre
     start = next(iter(REGISTRY["input_step"].starts({"channel": "Q_a"}, survey)))
     found = start.with_values({"f": 0.0, "time": 120.0 * point}).centred(survey)
     assert found.values == {"f": 0.0, "time": pytest.approx(120.0 * centre)}
-    onset = found.qualities()[1]
+    onset = found.parameter_specs()[1]
     assert onset.resolution == pytest.approx(120.0 * blind / 12.0**0.5)
     assert onset.spread(3.0) == pytest.approx(np.hypot(3.0, onset.resolution))
     if blind:

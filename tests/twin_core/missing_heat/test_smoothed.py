@@ -1,4 +1,4 @@
-"""The witness sees a heat that SciPy put in, says so in figures and words, and never stands in the way."""
+"""The smoothed heat is the one that SciPy put in, is told in figures and words, and never stands in the way."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Search
 from twin_core.errors import ModelError
 from twin_core.missing_heat import smoothed as module
-from twin_core.missing_heat.smoothed import NodeHeat, bear_witness, told_by
+from twin_core.missing_heat.smoothed import NodeHeat, added_to_report, smooth_missing_heat
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -55,7 +55,7 @@ def search() -> Search:
 
 
 def test_hidden_heat_is_seen_where_it_is(search):
-    told = bear_witness(search)
+    told = smooth_missing_heat(search)
     assert not told.notices
     heats = {heat.node: heat for heat in told.heats}
     assert set(heats) == {"a", "b"}
@@ -70,8 +70,8 @@ def test_hidden_heat_is_seen_where_it_is(search):
 
 def test_without_findings_there_is_nothing_to_agree_with(search):
     report = {"words": ["before"], "notices": ["old"]}
-    added = told_by(bear_witness(search), report)
-    row = next(r for r in added["witness"] if r["node"] == "b")
+    added = added_to_report(smooth_missing_heat(search), report)
+    row = next(r for r in added["missing_heat"] if r["node"] == "b")
     assert row["agrees"] is None and row["correlation_with_effect"] is None
     assert row["mean_W"] == pytest.approx(4.0, abs=1.5)
     assert added["words"][0] == "before" and "The declared model lacks" in " ".join(added["words"])
@@ -79,9 +79,9 @@ def test_without_findings_there_is_nothing_to_agree_with(search):
 
 
 def test_long_records_are_seen_from_their_end(search, monkeypatch):
-    whole = {heat.node: heat for heat in bear_witness(search).heats}
+    whole = {heat.node: heat for heat in smooth_missing_heat(search).heats}
     monkeypatch.setattr(module, "MAX_WORK", 16.0 * 200)
-    ends = {heat.node: heat for heat in bear_witness(search).heats}
+    ends = {heat.node: heat for heat in smooth_missing_heat(search).heats}
     for node, heat in ends.items():
         assert heat.time_s.size == 200 and heat.time_s[-1] == TIMES[-1]
         late = slice(-100, None)
@@ -97,10 +97,10 @@ def test_trouble_is_told_not_raised(search, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(module, "learn_heat_flow", fail)
-    told = bear_witness(search)
+    told = smooth_missing_heat(search)
     assert len(told.heats) == 2 and all(heat.law is None for heat in told.heats) and "no regression" in told.notices[0]
     monkeypatch.setattr(module, "smooth_extended", fail)
-    told = bear_witness(search)
+    told = smooth_missing_heat(search)
     assert told.heats == () and "could not be smoothed" in told.notices[0]
     assert told.rows() == [] and told.words() == []
 
@@ -145,6 +145,6 @@ def test_forces_that_are_not_finite_are_left_out(search, monkeypatch):
         return found
 
     monkeypatch.setattr(module, "smooth_extended", spoilt)
-    told = bear_witness(search)
+    told = smooth_missing_heat(search)
     assert len(told.heats) == 1 and any("not finite" in notice for notice in told.notices)
     assert told.heats[0].node == "b"

@@ -27,7 +27,7 @@ from twin_core.calibrate.undeclared.model import (
 )
 from twin_core.calibrate.undeclared.size import LARGEST_LOG_STEP, SizeSearch, first_size, new_search
 
-LEASHES = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
+EARLY_PRIOR_STD = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 """Prior deviations of logarithmic parameters in the first passes, while the undeclared heat is still too large."""
 
 LARGEST_STEP = 1.5
@@ -77,16 +77,20 @@ def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nomin
 
 
 def gauss_newton_step(
-    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], leash: float = np.inf
+    problem: Problem,
+    free: FloatArray,
+    undeclared: UndeclaredHeat,
+    nominals: Sequence[Nominal],
+    most_std: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free).
 
-    ``leash`` shortens the priors of logarithmic parameters for the early passes, in which the undeclared heat is still so
+    ``most_std`` shortens the priors of logarithmic parameters for the early passes, in which the undeclared heat is still so
     large that it could take over what conductances do.
     """
     parameters = problem.network.parameters
     values = parameters.to_values(free)
-    std = leashed(problem, leash)
+    std = tightened_prior_std(problem, most_std)
     hessian = np.diag(1.0 / std**2)
     gradient = (free - parameters.free) / std**2
     for nominal in nominals:
@@ -105,10 +109,10 @@ def _solved(hessian: FloatArray, gradient: FloatArray) -> FloatArray:
     return -scale * np.linalg.solve(damped, scale * gradient)
 
 
-def leashed(problem: Problem, leash: float) -> FloatArray:
-    """Return prior deviations with those of logarithmic parameters no longer than a leash."""
+def tightened_prior_std(problem: Problem, most_std: float) -> FloatArray:
+    """Return prior deviations with those of logarithmic parameters no longer than a most_std."""
     std = problem.network.parameters.prior_std.copy()
-    std[problem.logarithmic] = np.minimum(std[problem.logarithmic], leash)
+    std[problem.logarithmic] = np.minimum(std[problem.logarithmic], most_std)
     return std
 
 
@@ -118,7 +122,7 @@ def fit_with_undeclared_heat(
     *,
     near: HeatFit | None = None,
     n_passes: int = 12,
-    leashes: Sequence[float] = LEASHES,
+    early_prior_std: Sequence[float] = EARLY_PRIOR_STD,
     resized: Sequence[int] | None = None,
     deadline: float = NO_DEADLINE,
 ) -> HeatFit:
@@ -134,7 +138,7 @@ def fit_with_undeclared_heat(
         A fit of the same telemetry from which temperatures and undeclared heat start.
     n_passes
         Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
-    leashes
+    early_prior_std
         Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
     resized
         Nodes on which the undeclared heat is sized anew, beside one factor for all; by default all, and its length. With
@@ -164,10 +168,10 @@ def fit_with_undeclared_heat(
             break
         fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
         sizes = new_search(problem.n_nodes, LARGEST_LOG_STEP)
-        for leash in leashes:
+        for most_std in early_prior_std:
             if is_late(deadline) and np.isfinite(fit.log_likelihood):
                 break
-            fit = _pass(fit, sizes, leash, smoothing=True)
+            fit = _pass(fit, sizes, most_std, smoothing=True)
         started.append((fit, sizes))
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
     return _settle(fit, sizes, n_passes, deadline=deadline)
@@ -204,7 +208,7 @@ def _settle(
 def _pass(
     fit: HeatFit,
     sizes: SizeSearch,
-    leash: float,
+    most_std: float,
     *,
     smoothing: bool = False,
     resized: Sequence[int] | None = None,
@@ -217,7 +221,7 @@ def _pass(
         nominals = _smoothing_pass(problem, fit.values, fit.undeclared, nominals)
     free, undeclared = fit.free, fit.undeclared
     if not still:
-        free, undeclared, nominals = _improve(problem, free, undeclared, nominals, leash)
+        free, undeclared, nominals = _improve(problem, free, undeclared, nominals, most_std)
     undeclared, value = sizes.improve(problem, undeclared, nominals, resized)
     return HeatFit(problem, free, undeclared, nominals, value)
 
@@ -235,10 +239,10 @@ def with_capacities(
 
 
 def _improve(
-    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], leash: float
+    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], most_std: float
 ) -> tuple[FloatArray, UndeclaredHeat, tuple[Nominal, ...]]:
     """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
-    parameters, std = problem.network.parameters, leashed(problem, leash)
+    parameters, std = problem.network.parameters, tightened_prior_std(problem, most_std)
     now = parameters.to_values(free)
 
     def posterior(at: FloatArray, size: UndeclaredHeat, about: Sequence[Nominal]) -> float:
@@ -246,7 +250,7 @@ def _improve(
 
     before = posterior(free, undeclared, nominals)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
-        step, hessian = gauss_newton_step(problem, free, undeclared, nominals, leash)
+        step, hessian = gauss_newton_step(problem, free, undeclared, nominals, most_std)
         if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
             return free, undeclared, tuple(nominals)
     for share in STEP_SHARES:
