@@ -153,8 +153,11 @@ def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> boo
     return False
 
 
-def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float) -> bool:
-    """Take an option instead of a finding, if it is likelier by the odds asked for and passes; return whether it did."""
+def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float, margin: float | None = None) -> bool:
+    """Take an option instead of a finding, if it is likelier by a margin and passes; return whether it did.
+
+    The margin is the odds asked for unless it is given; supported by these the option must be in any case.
+    """
     places = finding.judged.places
     kept = _attempted_without(state, places)
     if kept is None:
@@ -162,7 +165,7 @@ def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float)
     without, lost = kept
     trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
     instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
-    if instead.evidence.log_bayes_factor <= lost + needed:
+    if instead.evidence.log_bayes_factor <= max(needed, lost + (needed if margin is None else margin)):
         return False
     examined, _ = examine(without, instead, needed)
     if examined.reason:
@@ -246,25 +249,36 @@ def tell_alternatives(state: Search, needed: float) -> None:
         )
         if compared is not None:
             state.findings[i] = compared
-            _lead_with_the_likeliest(state, i, needed)
+            _lead_with_the_best(state, i, needed)
             told = {e.place for option in state.findings[i].alternatives for e in option.effects}
             state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in told)]
 
 
-def _lead_with_the_likeliest(state: Search, position: int, needed: float) -> None:
-    """Exchange a finding for that of its alternatives which is likelier by the odds asked for and passes, if there is one.
+def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
+    """Exchange a finding for the best of its alternatives that passes, if it is simpler, or likelier by the odds asked for.
 
-    The first look ranks by linear responses: what it left out may turn out to explain more. The finding is an alternative then.
+    Alternatives explain as much where a coarse network makes nats say little, so that the simplest leads (and the likeliest of
+    these): what has more freedom fits the coarseness too. The first look ranks by linear responses, and what it left out may
+    turn out to explain more. The finding is an alternative then.
     """
     finding = state.findings[position]
-    best = min(finding.alternatives, key=worth, default=finding.judged)
-    if worth(best) >= worth(finding.judged) - needed:
-        return
-    replaced = partial(_in_place_of, state, finding, best, needed)
-    if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
-        others = [option for option in finding.alternatives if option is not best]
-        alternatives = tuple(sorted((finding.judged, *others), key=worth))
-        state.findings[position] = replace(state.findings[position], alternatives=alternatives)
+    options = (finding.judged, *finding.alternatives)
+    simplest = [j for j in options if _freedom(j) == min(map(_freedom, options))]
+    better, margin = simplest, -np.inf
+    if finding.judged in simplest:
+        better, margin = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed], needed
+    for best in sorted(better, key=worth):
+        replaced = partial(_in_place_of, state, finding, best, needed, margin)
+        if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
+            others = [option for option in finding.alternatives if option is not best]
+            alternatives = tuple(sorted((finding.judged, *others), key=worth))
+            state.findings[position] = replace(state.findings[position], alternatives=alternatives)
+            return
+
+
+def _freedom(judged: Judged) -> int:
+    """Return how many parameters a set of effects has."""
+    return sum(len(effect.parameter_specs()) for effect in judged.effects)
 
 
 def _attempted_without(state: Search, places: Collection[object]) -> Without | None:

@@ -629,7 +629,7 @@ def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
 ) -> None:
     """The finding that it takes the place of is among its alternatives then, and not refused."""
     found, other = judged("a", 60.0), judged("b", 10.0)
-    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {})
+    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {"alpha": 0.5, "T_w_K": 280.0})
     option = Judged((mix,), Evidence(nats, 0.0), stub(mix))
     told = Finding(found, (option, other))
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
@@ -644,6 +644,33 @@ def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
     names = [a.effects[0].name for a in finding.alternatives]
     assert names == (["constant_heat_load"] * 2 if leads == "boundary_mix" else ["boundary_mix", "constant_heat_load"])
     assert state.rejected == []
+
+
+@pytest.mark.parametrize(
+    ("alone", "reason", "leads"),
+    [(NEEDED + JUST, "", "constant_heat_load"), (NEEDED, "", "boundary_mix"), (50.0, NO_LAW, "boundary_mix")],
+    ids=["supported", "not supported", "no law"],
+)
+def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
+    monkeypatch: pytest.MonkeyPatch, alone: float, reason: str, leads: str
+) -> None:
+    """Less likely by many nats, which say little where both explain as much: of the simple ones the likelier leads."""
+    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {"alpha": 0.5, "T_w_K": 280.0})
+    found = Judged((mix,), Evidence(90.0, 0.0), stub(mix))
+    told = Finding(found, (judged("a", 60.0), judged("b", 10.0)))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    (finding,) = state.findings
+    assert [e.name for e in finding.effects] == [leads]
+    names = [a.effects[0].name for a in finding.alternatives]
+    assert names == (["boundary_mix", "constant_heat_load"] if leads != "boundary_mix" else ["constant_heat_load"] * 2)
+    if leads == "constant_heat_load":
+        assert finding.effects[0].where == {"node": "a"}
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
