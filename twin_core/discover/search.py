@@ -33,7 +33,12 @@ from twin_core.discover.judge import (
 from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
-from twin_core.discover.trajectories import SETTLING_NATS, extend_by_trajectory
+from twin_core.discover.trajectories import (
+    LEAST_MISFIT_SHARE,
+    SETTLING_NATS,
+    TOGETHER_MISFIT_SHARE,
+    extend_by_trajectory,
+)
 from twin_core.effects.base import Effect, Place
 
 MAX_FINDINGS = 4
@@ -139,16 +144,26 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
     widened = not state.findings or mean_excess(state.trial) > policy.WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
-    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback, pairs=widened)
-    told = state.attempt(first, f"{what}, by what the filter leaves")
+    first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
+    told, ranked = state.attempt(first, f"{what}, by what the filter leaves") or (False, [])
+    together = not (fallback or state.findings)  # what only pays off with another one is looked for once
+    if together and not told:
+        told = bool(state.attempt(partial(_pairs_by_heat, by_heat, ranked, needed), f"{what}, two at a time"))
     after = by_heat.trial
     if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
-        return bool(told)
-    beside = [] if told or fallback else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
-    known = by_heat.findings[-1].judged.places if told else ()
-    second = partial(extend_by_trajectory, by_trajectory, needed, fallback=fallback, beside=beside, known=known)
-    seen = state.attempt(second, f"{what}, by open-loop residuals")
+        return told
+
+    def look(seeds: Sequence[Trial], n_together: int) -> tuple[bool, list[Trial]]:
+        known = by_heat.findings[-1].judged.places if told else ()
+        second = partial(extend_by_trajectory, by_trajectory, needed, seeds, n_together, fallback=fallback, known=known)
+        return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
+
+    misfit = state.trial.misfit_share()
+    seen, sets = look([state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
+    if together and sets and not seen and misfit >= TOGETHER_MISFIT_SHARE:
+        beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
+        seen, _ = look([*sets, *beside], 2)
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
     refused = [*by_trajectory.rejected, *by_heat.rejected[len(state.rejected) :]]
     if not options:
@@ -169,8 +184,8 @@ def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
     return [min(singles, key=worth).trial] if singles else []
 
 
-def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool) -> bool:
-    """Extend by what the innovations say beside undeclared heat; by ``pairs`` where no single effect is supported."""
+def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bool, Sequence[Probe]]:
+    """Extend by the effect that innovations suggest beside undeclared heat; tell whether one holds, and how they rank."""
     screenings = screened(state.trial, state.trial.fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
@@ -179,11 +194,13 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool, pairs: bool
         chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
     else:
         chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS, state.first))
-    singles = [(effect,) for effect in chosen]
-    if accept(state, _by_heat(state, singles, n_tried), needed):
-        return True
-    both = _best_pairs(rankings[0], state.trial, needed) if pairs and not fallback else []
-    return accept(state, _by_heat(state, both, max(n_tried**2 // 2, 1)), needed)
+    return accept(state, _by_heat(state, [(effect,) for effect in chosen], n_tried), needed), rankings[0]
+
+
+def _pairs_by_heat(state: Search, ranked: Sequence[Probe], needed: float) -> bool:
+    """Extend by the two effects that innovations suggest together; False if none is supported."""
+    pairs = _best_pairs(ranked, state.trial, needed)
+    return accept(state, _by_heat(state, pairs, max(state.n_named**2 // 2, 1)), needed)
 
 
 def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:

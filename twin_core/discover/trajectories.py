@@ -23,10 +23,7 @@ from twin_core.effects.base import Effect, Place
 
 N_REFITS = 6
 TOGETHER_MISFIT_SHARE = 3.0
-"""Misfit over noise above which effects are tried together."""
-
-MOST_TOGETHER = 2
-"""Effects that are tried together where none helps alone: more fit anything on a long trajectory."""
+"""Misfit over noise above which two effects are tried together where none helps alone: more fit anything on a long trajectory."""
 
 LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""
@@ -40,9 +37,15 @@ N_KEPT, N_SETTLED = 4, 2
 
 
 def extend_by_trajectory(
-    state: Search, needed: float, *, fallback: bool, beside: Sequence[Trial] = (), known: Collection[Place] = ()
-) -> bool:
-    """Add the effect, or the effects that only pay off together, that open-loop residuals suggest; False if none holds.
+    state: Search,
+    needed: float,
+    seeds: Sequence[Trial],
+    n_together: int,
+    *,
+    fallback: bool,
+    known: Collection[Place] = (),
+) -> tuple[bool, list[Trial]]:
+    """Add the effects that open-loop residuals suggest, one on top of each seed; tell whether one holds, and what comes next.
 
     Parameters
     ----------
@@ -50,30 +53,28 @@ def extend_by_trajectory(
         The model so far; it grows by what is found.
     needed
         Log Bayes factor that is asked for.
+    seeds
+        Trials that are extended by one more effect: the model so far, or what may only pay off together with another.
+    n_together
+        Effects that are added to the model so far.
     fallback
         Whether to try the effects without a name.
-    beside
-        Trials that are extended by one more effect too: what may only pay off together with another.
     known
         Places of what is supported by what the innovations suggest: where it is the likeliest here too, it is not examined again.
+
+    Returns
+    -------
+    bool, list of Trial
+        The best trials are the seeds of a next look, at one effect more together.
     """
-    misfit = state.trial.misfit_share()
-    if misfit < LEAST_MISFIT_SHARE:
-        return False
-    seeds = [state.trial]
-    for n_together in range(1, 2 if fallback or misfit < TOGETHER_MISFIT_SHARE else MOST_TOGETHER + 1):
-        judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
-        sets = once_each(judged)[:N_KEPT]
-        if not sets:
-            break
-        n_tried = comb(state.n_named, n_together)
-        options = [*_settled(state, sets[:N_SETTLED], n_tried, needed), *sets]
-        if min(options, key=worth).places == known:
-            return False
-        if accept(state, options, needed):
-            return True
-        seeds = [*(j.trial for j in sets), *beside]
-    return False
+    judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
+    sets = once_each(judged)[:N_KEPT]
+    if not sets:
+        return False, []
+    options = [*_settled(state, sets[:N_SETTLED], comb(state.n_named, n_together), needed), *sets]
+    if min(options, key=worth).places == known:
+        return False, []
+    return accept(state, options, needed), [j.trial for j in sets]
 
 
 def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fallback: bool) -> list[Judged]:
