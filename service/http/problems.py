@@ -187,5 +187,10 @@ def _field(location: Sequence[str | int]) -> str:
 
 
 async def _on_crash(request: Request, error: Exception) -> Response:
-    log.error("unexpected error", exc_info=error, extra={"path": request.url.path})
+    return crashed(request.url.path, error)
+
+
+def crashed(path: str, error: Exception) -> Response:
+    """Return the response to a request in which something went wrong that nobody foresaw, and log that."""
+    log.error("unexpected error", exc_info=error, extra={"path": path})
     return problem(500, "unexpected error; it has been logged")

@@ -1,13 +1,45 @@
 """Connections that open and then say too little, too slowly, or without end are closed: they would be kept for ever."""
 
 import asyncio
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, cast
 
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from service.http.problems import MEDIA_TYPE, document
 
 MOST_HEAD_BYTES = 64 * 1024
+
+
+class Joining:
+    """A transport that sends the head of an answer together with what follows it at once: two packets wake a caller twice."""
+
+    __slots__ = ("_head", "_loop", "_transport", "write")
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+        """Keep back what is written first."""
+        self._transport, self._loop, self._head = transport, loop, b""
+        self.write: Callable[[bytes], None] = self._first
+
+    def _first(self, data: bytes) -> None:
+        """Keep the head, no longer than until the event loop goes on: a stream may have nothing to say for long."""
+        self._head, self.write = data, self._second
+        self._loop.call_soon(self.flush)
+
+    def _second(self, data: bytes) -> None:
+        """Send the head and what follows; all else is sent as it comes."""
+        self.write = self._transport.write
+        self._transport.write(self._head + data)
+
+    def flush(self) -> None:
+        """Send what was kept."""
+        if self.write == self._second:
+            self._second(b"")
+
+    def close(self) -> None:
+        """Close the connection behind what was written."""
+        self.flush()
+        self._transport.close()
 
 
 class PatientProtocol(HttpToolsProtocol):
@@ -48,8 +80,10 @@ class PatientProtocol(HttpToolsProtocol):
         if hosts > 1 or (hosts == 0 and self.parser.get_http_version() == "1.1"):
             raise ValueError("one Host is needed")  # the parser takes this for a malformed request
         self._stop()
-        self._in_body = True
+        self._in_body, before = True, self.cycle
         super().on_headers_complete()
+        if self.cycle is not before:
+            self.cycle.transport = cast(asyncio.Transport, Joining(self.transport, self.loop))
 
     def on_message_complete(self) -> None:
         """Expect the head of another request."""

@@ -3,13 +3,13 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.responses import StreamingResponse
-from starlette.routing import Route
 
 from service.archive import changes, export
 from service.archive.downsample import extremes
@@ -65,9 +65,22 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     require(request, Role.ingest)
     refuse_unknown(request)
     service: Service = request.app.state.service
-    entry = await service.find(twin)
+    await service.find(twin)
     body = (await request.receive()).get("body", b"")  # whole: see Bodies
-    parse = _parser(request.headers.get("content-type", ""))
+    media = request.headers.get("content-type", "")
+    parse = parser_of(media)
+    if parse is None:
+        told = media.partition(";")[0].strip().lower()[:60]
+        raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{told}'")
+    return Response(await taken(service, twin, parse, body), media_type="application/json")
+
+
+Parser = Callable[[bytes, Units], Batch]
+
+
+async def taken(service: Service, twin: str, parse: Parser, body: bytes) -> bytes:
+    """Store what a body holds, all of it or nothing, and return the answer: what became of each sample."""
+    entry = service.registry.find(twin) or await service.find(twin)
     try:
         return await _take(service, entry, body, parse)
     except (BadField, TwinGone):
@@ -79,28 +92,22 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     )  # another process has given it channels, or put it in place of another one
 
 
-async def _take(service: Service, entry: Entry, body: bytes, parse: Callable[[bytes, Units], Batch]) -> Response:
-    """Store what a body holds, all of it or nothing, and answer what became of each sample."""
+async def _take(service: Service, entry: Entry, body: bytes, parse: Parser) -> bytes:
     if len(body) > PARSE_APART_BYTES:
         batch = await asyncio.to_thread(parse, body, entry.units)
     else:
         batch = parse(body, entry.units)
     entry.refuse_implausible(batch.values)
-    receipt = await service.intake.store(entry, batch)
-    return Response(orjson.dumps(_report(receipt)), media_type="application/json")
+    return orjson.dumps(_report(await service.intake.store(entry, batch)))
 
 
-(ingesting,) = (route for route in router.routes if isinstance(route, Route))
-"""The route of ``ingest``, for a way past the framework."""
-
-
-def _parser(content_type: str) -> Callable[[bytes, Units], Batch]:
+@lru_cache(maxsize=64)
+def parser_of(content_type: str) -> Parser | None:
+    """Return what reads bodies of a type, None if nothing does."""
     media = content_type.partition(";")[0].strip().lower()
     if media == "application/json":
         return parse_columns
-    if media in (NDJSON, "application/ndjson", "application/jsonl"):
-        return parse_frames
-    raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{media[:60]}'")
+    return parse_frames if media in (NDJSON, "application/ndjson", "application/jsonl") else None
 
 
 def _report(receipt: Receipt) -> dict[str, Any]:
