@@ -7,7 +7,7 @@ import asyncio
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import accumulate
 from typing import NamedTuple
 
@@ -44,7 +44,8 @@ class Intake:
 
     def __init__(self, hub: Hub, live: Live, metrics: Metrics, clock_tolerance_s: float) -> None:
         """Tell streams, trackers and metrics what was stored; samples may be ahead of this machine's clock by a tolerance."""
-        self._hub, self._live, self._metrics = hub, live, metrics
+        self._hub, self._live = hub, live
+        self._samples = cache(metrics.samples.labels)
         self._tolerance_us = round(clock_tolerance_s * 1e6)
         self._loop = asyncio.get_running_loop()
         self._lines: dict[int, list[_Ticket]] = {}
@@ -52,24 +53,28 @@ class Intake:
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
-        batch = replace(batch, received_us=np.full(batch.time_us.size, now_us()))
+        batch = Batch(batch.time_us, batch.values, np.full(batch.time_us.size, now_us()))
+        if not tracing.is_on():
+            return await self._committed(twin, batch)
         with tracing.part("store", {"thermal_twin.twin": twin.name, "thermal_twin.samples": batch.time_us.size}):
             tracing.remember(twin.key)
             return await self._committed(twin, batch)
 
-    async def _committed(self, twin: Entry, batch: Batch) -> Receipt:
+    def _committed(self, twin: Entry, batch: Batch) -> "asyncio.Future[Receipt]":
         ticket = _Ticket(batch, self._loop.create_future())
         if twin.key not in self._lines:
             self._lines[twin.key] = []
             self._loop.call_soon(self._begin, twin)  # with what else the loop has at hand
         self._lines[twin.key].append(ticket)
-        return await ticket.receipt
+        return ticket.receipt
 
     def _begin(self, twin: Entry) -> None:
         """Hand what waits to the writer as one batch."""
         line = self._lines[twin.key]
-        n_values = accumulate(ticket.batch.values.size for ticket in line)
-        n_first = max(1, sum(n <= MOST_VALUES for n in n_values))
+        n_first = 1
+        if len(line) > 1:
+            n_values = accumulate(ticket.batch.values.size for ticket in line)
+            n_first = max(1, sum(n <= MOST_VALUES for n in n_values))
         tickets, self._lines[twin.key] = line[:n_first], line[n_first:]
         if tickets:
             batch = _joined([ticket.batch for ticket in tickets])
@@ -95,7 +100,7 @@ class Intake:
         counts = receipt.counts
         for outcome, status in OUTCOMES.items():
             if counts[status]:
-                self._metrics.samples.labels(twin.name, outcome).inc(counts[status])
+                self._samples(twin.name, outcome).inc(counts[status])
         if receipt.moved:
             log.warning(
                 "samples ahead of the present go into quarantine", extra={"twin": twin.name, "n": receipt.moved}

@@ -39,8 +39,8 @@ def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) ->
     """
     if tolerance_us == 0 or not batch.time_us.size:
         return appending.append(connection, twin, batch)
-    limit_us = int(batch.received.max()) + tolerance_us
-    if int(batch.time_us.max()) <= limit_us:
+    limit_us = _greatest(batch.received) + tolerance_us
+    if _greatest(batch.time_us) <= limit_us:
         receipt = appending.append(connection, twin, batch)
     else:
         receipt = _admit_some(connection, twin, batch, limit_us)
@@ -50,6 +50,11 @@ def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) ->
             last_us = connection.execute("SELECT last_us FROM head WHERE twin = ?", (twin,)).fetchone()[0]
             return replace(receipt, moved=moved, last_us=last_us)
     return receipt
+
+
+def _greatest(instants: NDArray[np.int64]) -> int:
+    """Return the last of some instants; of one, without what looking through an array costs."""
+    return int(instants[0]) if instants.size == 1 else int(instants.max())
 
 
 def _admit_some(connection: Connection, twin: int, batch: Batch, limit_us: int) -> Receipt:

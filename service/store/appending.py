@@ -11,7 +11,7 @@ from service.store.batch import Batch
 from service.store.blobs import matrix
 from service.store.connection import Connection, Head, Stage
 from service.store.errors import TwinGone
-from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
+from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, Merge, collapse, merge
 from service.store.quarters import divided, quarter_of
 from service.store.segments import MOST_SMALL_CHUNKS, MOST_SMALL_ROWS, SMALL, WITHIN, within
 
@@ -43,6 +43,8 @@ class Receipt:
     @cached_property
     def counts(self) -> list[int]:
         """How many samples have each status."""
+        if not self.status.any():
+            return [self.status.size, 0, 0, 0]
         counts: list[int] = np.bincount(self.status, minlength=QUARANTINED + 1).tolist()
         return counts
 
@@ -103,12 +105,18 @@ def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
         raise TwinGone(f"twin {twin} is gone")
     if batch.time_us.size == 0:
         return Receipt(np.empty(0, dtype=np.int8), row[0] + 1, row[1])
-    fate = merge(*_around(connection, twin, batch), batch.time_us, batch.values)
-    kept = fate.status == ACCEPTED
-    if not kept.any():
-        return Receipt(fate.status, row[0] + 1, row[1])
-    stored = batch.take(kept)
-    ends = (int(stored.time_us.min()), int(stored.time_us.max()))
+    instants = np.unique(batch.time_us)
+    known = _around(connection, twin, batch, instants)
+    if known[0].size == 0 and instants.size == batch.time_us.size:  # nothing to be compared with
+        fate, stored = Merge(np.zeros(instants.size, dtype=np.int8), instants.size), batch
+        ends = (int(instants[0]), int(instants[-1]))
+    else:
+        fate = merge(*known, batch.time_us, batch.values)
+        kept = fate.status == ACCEPTED
+        if not kept.any():
+            return Receipt(fate.status, row[0] + 1, row[1])
+        stored = batch.take(kept)
+        ends = (int(stored.time_us.min()), int(stored.time_us.max()))
     head = _advance(connection, twin, stored, fate.n_instants, ends, after_all=False)
     if head is None:
         raise TwinGone(f"twin {twin} is gone")
@@ -151,9 +159,11 @@ def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int
         segments.compact(connection, {twin: batch.values.shape[0]})
 
 
-def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
-    instants, n_rows = np.unique(batch.time_us), batch.values.shape[0]
+def _around(
+    connection: Connection, twin: int, batch: Batch, instants: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what the archive holds at the instants of a batch, in order, reading only the chunks that can hold any of them."""
+    n_rows = batch.values.shape[0]
     query = f"SELECT id, first_us, last_us FROM chunk WHERE {WITHIN}"
     overlapping = connection.execute(query, within(twin, int(instants[0]), int(instants[-1]) + 1)).fetchall()
     spans = np.array(overlapping, dtype=np.int64).reshape(-1, 3)
