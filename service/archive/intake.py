@@ -32,6 +32,10 @@ log = logging.getLogger("service")
 OUTCOMES = {"accepted": ACCEPTED, "duplicate": DUPLICATE, "rejected": CONFLICT, "quarantined": QUARANTINED}
 
 
+MOST_SMALL_VALUES = 8192
+"""A batch of no more than so many values is small: writing it takes about as long as handing it to another thread."""
+
+
 class _Ticket(NamedTuple):
     """A batch that waits to be stored, and where its receipt goes."""
 
@@ -50,6 +54,8 @@ class Intake:
         self._loop = asyncio.get_running_loop()
         self._lines: dict[int, list[_Ticket]] = {}
         """Of each twin with a commit under way or about to begin: what waits for the next one."""
+        self._tidied: set[int] = set()
+        """Twins whose small segments are being compacted."""
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
@@ -78,9 +84,8 @@ class Intake:
         tickets, self._lines[twin.key] = line[:n_first], line[n_first:]
         if tickets:
             batch = _joined([ticket.batch for ticket in tickets])
-            self._hub.submit_then(
-                partial(self._done, twin, tickets), twin.key, take_in, twin, batch, self._tolerance_us
-            )
+            submit = self._hub.submit_small if batch.values.size <= MOST_SMALL_VALUES else self._hub.submit_then
+            submit(partial(self._done, twin, tickets), twin.key, take_in, twin, batch, self._tolerance_us)
         else:
             del self._lines[twin.key]
 
@@ -106,8 +111,23 @@ class Intake:
                 "samples ahead of the present go into quarantine", extra={"twin": twin.name, "n": receipt.moved}
             )
             self._live.archive_changed(twin)
+        if receipt.is_crowded and twin.key not in self._tidied:
+            self._tidied.add(twin.key)
+            self._hub.submit_then(partial(self._is_tidy, twin), twin.key, tidy, twin)
         if counts[ACCEPTED]:
             self._live.arrived(twin)
+
+    def _is_tidy(self, twin: Entry, _: None, error: BaseException | None) -> None:
+        """Hear that the small segments of a twin are compacted, or that this failed: then the next batch asks for it again."""
+        self._tidied.discard(twin.key)
+        if error is not None:
+            log.warning("small segments were not compacted", extra={"twin": twin.name, "reason": type(error).__name__})
+
+
+def tidy(connection: Connection, twin: Entry) -> tuple[None, Sequence[SampleStretch]]:
+    """Compact the small segments of a twin."""
+    segments.compact(connection, {twin.key: len(twin.channels)})
+    return None, ()
 
 
 def _joined(batches: list[Batch]) -> Batch:
@@ -120,8 +140,11 @@ def _joined(batches: list[Batch]) -> Batch:
 def take_in(
     connection: Connection, twin: Entry, batch: Batch, tolerance_us: int
 ) -> tuple[Receipt, Sequence[SampleStretch]]:
-    """Store a batch; return what became of it, and what the stream hears. A tolerance of 0 takes in what lies ahead, too."""
-    receipt = admit(connection, twin.key, batch, tolerance_us)
+    """Store a batch; return what became of it, and what the stream hears. A tolerance of 0 takes in what lies ahead, too.
+
+    Small segments are not compacted: the receipt says when that is due.
+    """
+    receipt = admit(connection, twin.key, batch, tolerance_us, compacts=False)
     n_stored = receipt.counts[ACCEPTED]
     if n_stored == 0:
         return receipt, ()
