@@ -13,7 +13,7 @@ from service.http.auth import Gate
 from service.http.body_limit import Bodies
 from service.http.deps import known_parameters
 from service.http.head import Heads
-from service.http.lane import Application, Lane
+from service.http.lane import Lane
 from service.http.observe import Observe
 from service.http.routes import (
     admin,
@@ -93,7 +93,7 @@ def create_app(
         finally:
             store.close()
 
-    app = Application(
+    app = FastAPI(
         title="thermal-twin",
         version="1",
         lifespan=lifespan,
@@ -116,6 +116,5 @@ def create_app(
     app.add_middleware(Audit)
     app.add_middleware(Observe, metrics=metrics)
     app.add_middleware(Heads)
-    bodies = Bodies(app, settings.max_body_bytes, settings.body_timeout_s)
-    app.lane = Lane(Gate(app, keys), bodies, Observe(app, metrics))
+    app.state.lane = Lane(app, Gate(app, keys), Observe(app, metrics))
     return app

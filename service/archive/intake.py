@@ -5,11 +5,11 @@ What a commit costs beside the disk (statements, hand-overs between threads) is 
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import accumulate
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,11 +36,15 @@ MOST_SMALL_VALUES = 8192
 """A batch of no more than so many values is small: writing it takes about as long as handing it to another thread."""
 
 
+Then = Callable[[Any, BaseException | None], None]
+"""Who hears the receipt of a batch, or else the error."""
+
+
 class _Ticket(NamedTuple):
     """A batch that waits to be stored, and where its receipt goes."""
 
     batch: Batch
-    receipt: "asyncio.Future[Receipt]"
+    then: Then
 
 
 class Intake:
@@ -59,20 +63,19 @@ class Intake:
 
     async def store(self, twin: Entry, batch: Batch) -> Receipt:
         """Return what became of a batch, once it is durably committed."""
-        batch = Batch(batch.time_us, batch.values, np.full(batch.time_us.size, now_us()))
-        if not tracing.is_on():
-            return await self._committed(twin, batch)
+        receipt: asyncio.Future[Receipt] = self._loop.create_future()
         with tracing.part("store", {"thermal_twin.twin": twin.name, "thermal_twin.samples": batch.time_us.size}):
             tracing.remember(twin.key)
-            return await self._committed(twin, batch)
+            self.enter(twin, batch, partial(settle, receipt))
+            return await receipt
 
-    def _committed(self, twin: Entry, batch: Batch) -> "asyncio.Future[Receipt]":
-        ticket = _Ticket(batch, self._loop.create_future())
+    def enter(self, twin: Entry, batch: Batch, then: Then) -> None:
+        """Store a batch with what else the event loop has at hand, and let ``then`` hear its receipt, or the error."""
+        batch = Batch(batch.time_us, batch.values, np.full(batch.time_us.size, now_us()))
         if twin.key not in self._lines:
             self._lines[twin.key] = []
-            self._loop.call_soon(self._begin, twin)  # with what else the loop has at hand
-        self._lines[twin.key].append(ticket)
-        return ticket.receipt
+            self._loop.call_soon(self._begin, twin)
+        self._lines[twin.key].append(_Ticket(batch, then))
 
     def _begin(self, twin: Entry) -> None:
         """Hand what waits to the writer as one batch."""
@@ -97,7 +100,7 @@ class Intake:
         for ticket in tickets:
             stop = first + ticket.batch.time_us.size
             alone = error is not None or len(tickets) == 1
-            settle(ticket.receipt, receipt if alone else replace(receipt, status=receipt.status[first:stop]), error)
+            ticket.then(receipt if alone else replace(receipt, status=receipt.status[first:stop]), error)
             first = stop
         self._loop.call_soon(self._begin, twin)
 

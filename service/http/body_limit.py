@@ -7,7 +7,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import Refusal
-from service.http.problems import Problem, problem, status_of
+from service.http.problems import Problem, late_body, problem, status_of
 
 LEAST_RATE_BYTES_PER_S = 32 * 1024
 DECODE_APART_BYTES = 64 * 1024
@@ -63,7 +63,7 @@ class Bodies:
                     if more:
                         deadline.reschedule(started + self._timeout_s + size / LEAST_RATE_BYTES_PER_S)
         except TimeoutError:
-            raise Problem(408, f"the body did not arrive within {self._timeout_s:g} s") from None
+            raise late_body(self._timeout_s) from None
         if size > self._max_bytes:
             await self._drain(receive)
             raise self._too_large()

@@ -78,27 +78,33 @@ async def ingest(request: Request, twin: TwinName) -> Response:
 Parser = Callable[[bytes, Units], Batch]
 
 
+OUTDATED = (BadField, TwinGone)
+"""What goes wrong where another process has given a twin channels, or put another one in its place."""
+
+
 async def taken(service: Service, twin: str, parse: Parser, body: bytes) -> bytes:
     """Store what a body holds, all of it or nothing, and return the answer: what became of each sample."""
-    entry = service.registry.find(twin) or await service.find(twin)
+    entry = await service.find(twin)
     try:
         return await _take(service, entry, body, parse)
-    except (BadField, TwinGone):
+    except OUTDATED:
         now = await service.find_now(twin)
         if now is entry:
             raise
-    return await _take(
-        service, now, body, parse
-    )  # another process has given it channels, or put it in place of another one
+    return await _take(service, now, body, parse)
 
 
 async def _take(service: Service, entry: Entry, body: bytes, parse: Parser) -> bytes:
-    if len(body) > PARSE_APART_BYTES:
-        batch = await asyncio.to_thread(parse, body, entry.units)
-    else:
-        batch = parse(body, entry.units)
+    is_large = len(body) > PARSE_APART_BYTES
+    batch = await asyncio.to_thread(read, entry, parse, body) if is_large else read(entry, parse, body)
+    return report(await service.intake.store(entry, batch))
+
+
+def read(entry: Entry, parse: Parser, body: bytes) -> Batch:
+    """Return the samples of a body; BadField or Problem if any of it is malformed or cannot be true."""
+    batch = parse(body, entry.units)
     entry.refuse_implausible(batch.values)
-    return orjson.dumps(_report(await service.intake.store(entry, batch)))
+    return batch
 
 
 @lru_cache(maxsize=64)
@@ -110,18 +116,24 @@ def parser_of(content_type: str) -> Parser | None:
     return parse_frames if media in (NDJSON, "application/ndjson", "application/jsonl") else None
 
 
-def _report(receipt: Receipt) -> dict[str, Any]:
+def report(receipt: Receipt) -> bytes:
+    """Return the answer that tells what became of each sample."""
+    return orjson.dumps(told_of(receipt))
+
+
+def told_of(receipt: Receipt) -> dict[str, Any]:
+    """Return what became of each sample."""
     counts = receipt.counts
     conflicts = receipt.conflicts if counts[CONFLICT] else []
-    report = {
+    told = {
         "accepted": counts[ACCEPTED],
         "duplicates": counts[DUPLICATE],
         "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
     if counts[QUARANTINED]:
-        report["quarantined"] = [{"index": index, "reason": AHEAD} for index in receipt.quarantined]
-    return report
+        told["quarantined"] = [{"index": index, "reason": AHEAD} for index in receipt.quarantined]
+    return told
 
 
 @router.get("", dependencies=[reads], response_model=Archive)
@@ -220,7 +232,7 @@ async def release(service: Running, twin: NamedTwin, request: Interval | None = 
     receipt = await service.hub.write(twin.key, changes.release, twin, start_us, stop_us)
     service.live.arrived(twin)
     log.warning("samples were let out of quarantine", extra={"twin": twin.name, "n": int(receipt.status.size)})
-    return IngestReport(**_report(receipt))
+    return IngestReport(**told_of(receipt))
 
 
 @quarantine.delete("", dependencies=[operates])
