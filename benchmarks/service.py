@@ -206,8 +206,8 @@ def main() -> None:
     commit_ms = 1e3 / raw_commits
     note = (
         f"Frames per second of {CHANNELS} channels, the best of {rounds} rounds. A durable commit took {commit_ms:.2f} ms here. "
-        "Of one client, which waits for each answer, the bound is the way over HTTP and the commit one after the other; of several, "
-        "the slower of the two. Where a commit is slow, requests share it, and the service exceeds raw inserts. "
+        "Of one client, which waits for each answer, the bound is the way over HTTP and the commit one after the other; of "
+        "several, the slower of the two. Where a commit is slow, requests share it, and the service exceeds raw inserts. "
         f"Load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     )
     save_table("service", "Ingest", markdown_table(HEADER, rows), "benchmarks.service", note)
