@@ -219,7 +219,9 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
         )
     if lag.quarantined:
         told.append(
-            f"{lag.quarantined} sample(s) ahead of the receive clock are in quarantine and take no part: its clock may be wrong"
+            "1 sample ahead of the receive clock is in quarantine and not used: its clock may be wrong"
+            if lag.quarantined == 1
+            else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
 
