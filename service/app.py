@@ -116,5 +116,5 @@ def create_app(
     app.add_middleware(Audit)
     app.add_middleware(Observe, metrics=metrics)
     app.add_middleware(Heads)
-    app.state.lane = Lane(app, Gate(app, keys), Observe(app, metrics))
+    app.state.lane = Lane(app, Gate(app, keys), Observe(app, metrics), settings.max_body_bytes)
     return app

@@ -39,9 +39,10 @@ Reply = Callable[[int, Headers, bytes], None]
 class Lane:
     """Takes samples in past the layers, of which it asks the same questions."""
 
-    def __init__(self, app: FastAPI, gate: Gate, observe: Observe) -> None:
+    def __init__(self, app: FastAPI, gate: Gate, observe: Observe, max_body_bytes: int) -> None:
         """Ask the gate who may pass, let requests be counted as everywhere, and hand samples to the running service."""
         self._app, self._gate, self._observe = app, gate, observe
+        self._most_bytes = min(MOST_BYTES, max_body_bytes)
         self._under_way: set[asyncio.Task[None]] = set()
 
     def enters(self, url: bytes, headers: Headers, client: tuple[str, int] | None) -> "Plain | None":
@@ -55,7 +56,7 @@ class Lane:
         service: Service = self._app.state.service
         entry = service.registry.find(url[len(BEFORE) : -len(AFTER)].decode("latin-1"))
         parse = telemetry.parser_of(media)
-        if entry is None or parse is None or int(length) > MOST_BYTES:
+        if entry is None or parse is None or int(length) > self._most_bytes:
             return None
         role = self._gate.role({"path": url.decode("latin-1"), "client": client}, named)
         return Plain(self, service, entry, parse) if role is not None and role >= Role.ingest else None

@@ -25,7 +25,8 @@ ORDINARY = (*PLAIN, "X-Anything: sends it the ordinary way")
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    with Server(tmp_path_factory.mktemp("lane"), assimilate="false", body_timeout_s="2") as running:
+    settings = {"assimilate": "false", "body_timeout_s": "2", "max_body_bytes": "20000"}
+    with Server(tmp_path_factory.mktemp("lane"), **settings) as running:
         running.client().register(SPEC)
         yield running
 
@@ -158,6 +159,15 @@ def test_a_body_that_never_comes_is_refused(server: Server) -> None:
         assert headers["connection"] == "close"
         assert connection.recv(1) == b""
     assert ask(server, request(frame(8000)))[2]["accepted"] == 1  # nothing of it was stored
+
+
+@pytest.mark.parametrize("headers", [PLAIN, ORDINARY], ids=["plain", "ordinary"])
+def test_a_body_beyond_the_limit_is_refused(server: Server, headers: tuple[str, ...]) -> None:
+    times = [8100.0 + k for k in range(2000)]
+    body = json.dumps({"time": times, "values": {"T_a": [290.0] * len(times)}}).encode()
+    assert len(body) > 20_000
+    status, _, document = ask(server, request(body, headers))
+    assert (status, "20000 bytes" in document["detail"]) == (413, True)
 
 
 def test_whoever_hangs_up_harms_nobody(server: Server) -> None:
