@@ -1,5 +1,6 @@
 """Forecasts from the assimilated state, with planned inputs."""
 
+import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -157,8 +158,7 @@ class Look:
 async def look_ahead(tracker: Known, database: Database, engine: Engine, request: ForecastRequest) -> Look:
     """Forecast from the present state; Refusal if there is none, or if the request asks for too much."""
     active, position = await state_of(tracker)
-    lag = await behind(tracker, database)
-    past = await past_of(tracker.twin, database, active, position)
+    lag, past = await asyncio.gather(behind(tracker, database), past_of(tracker.twin, database, active, position))
     task = build_task(tracker.twin, active, position, past, request)
     return Look(active, position, lag, await engine.forecast(active.document, task))
 

@@ -47,8 +47,9 @@ async def forecast_as_is(
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
     tracker = service.live.state(twin)
-    silent_s = forecasts.silence_s(twin, await service.live.beats(twin))
-    look = await forecasts.look_ahead(tracker, service.database, service.live.engine, request)
+    ahead = forecasts.look_ahead(tracker, service.database, service.live.engine, request)
+    look, beats = await asyncio.gather(ahead, service.live.beats(twin))
+    silent_s = forecasts.silence_s(twin, beats)
     expected = list(limits.expected(twin, look.position.time_us, look.made))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
