@@ -1,13 +1,23 @@
 """Plain ingest goes past the framework: what it is answered is what the ordinary way answers, whatever comes over the wire."""
 
+import asyncio
 import json
 import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
+from fastapi import FastAPI
 
+from service.http.lane import Lane, Plain
+from service.http.telemetry_body import parse_columns
+from service.store.appending import Receipt
+from service.store.batch import Batch
+from service.twins.registry import Entry
 from tests.service.server import Server
 
 pytestmark = pytest.mark.e2e
@@ -226,3 +236,46 @@ def test_what_is_under_way_is_answered_before_the_service_ends(tmp_path: Path) -
             connection.sendall(message[-1:])
             status, headers, document = answers(connection, 1)[0]
         assert (status, headers["connection"], document["accepted"]) == (200, "close", 1)
+
+
+def entry(specification: dict) -> Entry:
+    return Entry(1, "lane", tuple(specification["channels"]), specification)
+
+
+class Elsewhere:
+    """A service among several, which learns of a twin's new channel only when it asks."""
+
+    def __init__(self) -> None:
+        self.wider = entry({**SPEC, "channels": {**SPEC["channels"], "T_c": SPEC["channels"]["T_b"]}})
+        self.database = SimpleNamespace(is_shared=True)
+        self.stored: list[int] = []
+        self.intake = self
+
+    async def find(self, name: str) -> Entry:
+        return entry(SPEC)
+
+    async def find_now(self, name: str) -> Entry:
+        return self.wider
+
+    async def store(self, twin: Entry, batch: Batch) -> Receipt:
+        self.stored.append(len(twin.channels))
+        return Receipt(np.zeros(batch.time_us.size, dtype=np.int8), 1, int(batch.time_us[-1]))
+
+
+@pytest.mark.parametrize(("channel", "status", "stored"), [("T_c", 200, [3]), ("T_d", 422, [])])
+def test_a_channel_that_came_elsewhere_is_taken_at_once(channel: str, status: int, stored: list[int]) -> None:
+    service = Elsewhere()
+    counted: list[int] = []
+    observe = SimpleNamespace(count=lambda *told: counted.append(told[2]))
+    lane = Lane(FastAPI(), cast(Any, None), cast(Any, observe), 10_000)
+
+    async def answered() -> tuple[int, bytes]:
+        heard: asyncio.Future[tuple[int, bytes]] = asyncio.get_running_loop().create_future()
+        plain = Plain(lane, cast(Any, service), entry(SPEC), parse_columns)
+        plain.body += json.dumps({"time": [1], "values": {channel: [290.0]}}).encode()
+        plain.take(lambda status, _, body: heard.set_result((status, body)))
+        return await heard
+
+    found, body = asyncio.run(answered())
+    assert (found, service.stored, counted) == (status, stored, [status])
+    assert (json.loads(body).get("accepted") == 1) == (status == 200)
