@@ -15,6 +15,7 @@ from service.live.position import Position
 from service.live.pulse import Beat
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
+from service.store.anomalies import WORDS
 from service.store.database import Database
 from service.store.models import Active
 from service.twins.registry import Entry
@@ -224,6 +225,12 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
             else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
+
+
+def doubts(twin: Entry, open_kinds: Mapping[str, Sequence[str]]) -> list[str]:
+    """Say of which sensors the readings themselves are in doubt, from the kinds of the anomalies that last."""
+    found = [(name, kind) for name in twin.sensors for kind in open_kinds.get(name, []) if kind in ("stuck", "dropout")]
+    return [f"{name} {WORDS[kind]}; what the forecast says of it may be wrong" for name, kind in found]
 
 
 def render(twin: Entry, look: Look, quantiles: Sequence[float], limits: Sequence[Json]) -> Json:
