@@ -9,8 +9,8 @@ Two things cannot be avoided, and both are measured beside the service, in turn 
 The bound follows from how they may overlap. Several clients keep both busy at once, so no more than the slower of the two is
 possible: bound = min(bare, raw). One client that waits for each answer has nothing else under way: its request travels, is
 committed, and only then is answered, so that their times add: 1 / bound = 1 / bare + 1 / raw. Sharing commits among requests
-that wait together is not in the bound of several clients, so that on a slow disk the service may exceed it; nor is that the service
-stores a large batch as one segment, which takes less than a thousand rows.
+that wait together is not in the bound of several clients, so that on a slow disk the service may exceed it; nor is that the
+service stores a large batch as one segment, which takes less than a thousand rows.
 
 ``python -m benchmarks.service`` writes ``benchmarks/tables/service.md``.
 """
@@ -208,8 +208,8 @@ def main() -> None:
     note = (
         f"Frames per second of {CHANNELS} channels, the best of {rounds} rounds. A durable commit took {commit_ms:.2f} ms here. "
         "Of one client, which waits for each answer, the bound is the way over HTTP and the commit one after the other; of "
-        "several, the slower of the two. Where a commit is slow, requests share it, and the service exceeds raw inserts; so it does "
-        "with a thousand frames, which it stores as one segment and not as rows. "
+        "several, the slower of the two. Where a commit is slow, requests share it, and the service exceeds raw inserts; so it "
+        "does with a thousand frames, which it stores as one segment and not as rows. "
         f"Load of the machine: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     )
     save_table("service", "Ingest", markdown_table(HEADER, rows), "benchmarks.service", note)
