@@ -13,6 +13,7 @@ from service.http.auth import Gate
 from service.http.body_limit import Bodies
 from service.http.deps import known_parameters
 from service.http.head import Heads
+from service.http.lane import Lane
 from service.http.observe import Observe
 from service.http.routes import (
     admin,
@@ -28,7 +29,6 @@ from service.http.routes import (
     telemetry,
     twins,
 )
-from service.http.shortcut import Shortcut
 from service.monitoring.metrics import Metrics
 from service.running.start import running
 from service.settings import Settings, read_settings
@@ -110,11 +110,11 @@ def create_app(
     app.include_router(dashboard.router)
     for path, files in dashboard.assets().items():
         app.mount(path, files, name=path)
-    app.add_middleware(Shortcut, route=telemetry.ingesting)
     app.add_middleware(Bodies, max_bytes=settings.max_body_bytes, timeout_s=settings.body_timeout_s)
     app.state.keys = keys
     app.add_middleware(Gate, keys=keys)
     app.add_middleware(Audit)
     app.add_middleware(Observe, metrics=metrics)
     app.add_middleware(Heads)
+    app.state.lane = Lane(app, Gate(app, keys), Observe(app, metrics), settings.max_body_bytes)
     return app

@@ -23,6 +23,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _EPOCH_UTC = datetime(1970, 1, 1)
 _RFC3339 = re.compile(r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,18}))?([Zz]|[+-]\d\d:\d\d)", re.ASCII)
 _FORM = "write RFC 3339 such as 2026-01-03T00:00:00Z, or unix seconds"
+_NUMBERS = (float, int)
 _BLOCK = 32
 """From here on the vectorised parser is the faster one."""
 
@@ -35,6 +36,8 @@ def parse_instants(values: Sequence[Any], field: str = "time") -> Instants:
     BadField
         Naming the first element that is no instant or lies outside 1970 to 2199.
     """
+    if len(values) == 1 and type(values[0]) in _NUMBERS and 0.0 <= values[0] < _LAST_S:
+        return np.array([round(values[0] * 1e6)], dtype=np.int64)
     kinds = set(map(type, values))
     if kinds <= {float, int}:
         seconds = np.array(values, dtype=np.float64)

@@ -71,7 +71,7 @@ def serve(
         app,
         log_config=None,
         access_log=False,
-        http=patient(settings.body_timeout_s),
+        http=patient(settings.body_timeout_s, app.state.lane),
         ws="websockets-sansio",
         lifespan="on",
         timeout_keep_alive=30,

@@ -58,7 +58,10 @@ class Audit:
         if refused:
             line = (*line[:5], "")  # a query may hold a key
         names = ("who", "method", "path", "status", "client", "query")
-        log.info("refused" if refused else "changed", extra=dict(zip(names, line, strict=True)))
+        log.info(
+            "refused" if refused else "changed" if status < 400 else "not changed",
+            extra=dict(zip(names, line, strict=True)),
+        )
         if refused and not self._has_room():
             return
         service = getattr(scope["app"].state, "service", None)

@@ -31,18 +31,31 @@ class Gate:
             await self._app(scope, receive, send)
             return
         headers = {name: value for name, value in scope["headers"] if name in _HEADERS}
-        key = self._keys.find(sent) if self._keys.needed and (sent := _sent(headers)) else None
+        key = self._key(headers)
         refusal = self._refusal(scope, headers, key)
         state = scope.setdefault("state", {})
         if key is not None or not self._keys.needed:
             state["who"] = "this machine" if key is None else key.name
         if refusal is None:
-            state["role"] = Role.operate if not self._keys.needed else None if key is None or key.is_over else key.role
+            state["role"] = self._role_of(key)
             await self._app(scope, receive, send)
         else:
             status, detail = refusal
             extra = {"WWW-Authenticate": "Bearer"} if status == 401 else None
             await problem(status, detail, headers=extra)(scope, receive, send)
+
+    def role(self, scope: Scope, headers: dict[bytes, bytes]) -> Role | None:
+        """Return what a caller may do, None if it is refused or has no role."""
+        key = self._key(headers)
+        return self._role_of(key) if self._refusal(scope, headers, key) is None else None
+
+    def _key(self, headers: dict[bytes, bytes]) -> Key | None:
+        return self._keys.find(sent) if self._keys.needed and (sent := _sent(headers)) else None
+
+    def _role_of(self, key: Key | None) -> Role | None:
+        if not self._keys.needed:
+            return Role.operate
+        return None if key is None or key.is_over else key.role
 
     def _refusal(self, scope: Scope, headers: dict[bytes, bytes], key: Key | None) -> tuple[int, str] | None:
         path = scope["path"]

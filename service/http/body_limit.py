@@ -3,10 +3,11 @@
 import asyncio
 import zlib
 
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import Refusal
-from service.http.problems import Problem, problem, status_of
+from service.http.problems import Problem, late_body, problem, status_of
 
 LEAST_RATE_BYTES_PER_S = 32 * 1024
 DECODE_APART_BYTES = 64 * 1024
@@ -30,20 +31,19 @@ class Bodies:
             await self._app(scope, receive, send)
             return
         try:
-            body = await self._read(headers, receive)
+            body = await self.read(headers, receive)
             encoding = headers.get(b"content-encoding", b"identity").lower()
             if encoding not in (b"", b"identity"):
                 body = await _decode(body, encoding, self._max_bytes)
         except Refusal as error:
-            await problem(status_of(error), error.detail, error.errors, headers={"Connection": "close"})(
-                scope, receive, send
-            )
+            await refused(error)(scope, receive, send)
             return
-        except _Gone:
+        except Gone:
             return
         await self._app(scope, _replay(body, receive), send)
 
-    async def _read(self, headers: dict[bytes, bytes], receive: Receive) -> bytes:
+    async def read(self, headers: dict[bytes, bytes], receive: Receive) -> bytes:
+        """Return a body as it is sent; Refusal if it is too large or too slow, Gone if its sender hangs up."""
         declared = int(headers.get(b"content-length", b"0"))
         if declared > self._max_bytes:
             if b"expect" not in headers:
@@ -63,7 +63,7 @@ class Bodies:
                     if more:
                         deadline.reschedule(started + self._timeout_s + size / LEAST_RATE_BYTES_PER_S)
         except TimeoutError:
-            raise Problem(408, f"the body did not arrive within {self._timeout_s:g} s") from None
+            raise late_body(self._timeout_s) from None
         if size > self._max_bytes:
             await self._drain(receive)
             raise self._too_large()
@@ -84,14 +84,19 @@ class Bodies:
         return Problem(413, f"the body is larger than {self._max_bytes} bytes; send smaller batches")
 
 
-class _Gone(Exception):
+def refused(error: Refusal) -> Response:
+    """Return the answer to a body that was not read to its end: nothing else can be read from that connection."""
+    return problem(status_of(error), error.detail, error.errors, headers={"Connection": "close"})
+
+
+class Gone(Exception):
     """The caller hung up in the middle of its body: nobody is left to answer."""
 
 
 async def _next(receive: Receive) -> tuple[bytes, bool]:
     message = await receive()
     if message["type"] == "http.disconnect":
-        raise _Gone
+        raise Gone
     return message.get("body", b""), message.get("more_body", False)
 
 

@@ -39,6 +39,11 @@ class Problem(Refusal):
         self.status = status
 
 
+def late_body(timeout_s: float) -> Problem:
+    """Return the refusal of a body that takes too long to arrive."""
+    return Problem(408, f"the body did not arrive within {timeout_s:g} s")
+
+
 STATUS: Mapping[type[Refusal], int] = {
     BadField: 422,
     TooLittle: 422,
@@ -187,5 +192,10 @@ def _field(location: Sequence[str | int]) -> str:
 
 
 async def _on_crash(request: Request, error: Exception) -> Response:
-    log.error("unexpected error", exc_info=error, extra={"path": request.url.path})
+    return crashed(request.url.path, error)
+
+
+def crashed(path: str, error: BaseException) -> Response:
+    """Return the response to a request in which something went wrong that nobody foresaw, and log that."""
+    log.error("unexpected error", exc_info=error, extra={"path": path})
     return problem(500, "unexpected error; it has been logged")

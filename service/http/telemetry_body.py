@@ -47,13 +47,12 @@ def parse_columns(body: bytes, channels: Units) -> Batch:
     for name, column in columns.items():
         if name not in channels or type(column) is not list or len(column) != n_times:
             _refuse_column(name, column, n_times, channels)
+    matrix = _matrix(columns, may_hold_booleans=b"true" in body or b"false" in body) if columns else None
+    if matrix is not None and list(columns) == names:
+        return Batch(parse_instants(times), matrix)
     values = np.full((len(names), n_times), np.nan)
-    if columns:
-        matrix = _matrix(columns, may_hold_booleans=b"true" in body or b"false" in body)
-        if list(columns) == names:
-            values = matrix
-        else:
-            values[[names.index(name) for name in columns]] = matrix
+    if matrix is not None:
+        values[[names.index(name) for name in columns]] = matrix
     return Batch(parse_instants(times), values)
 
 

@@ -1,5 +1,6 @@
 """Forecasts from the assimilated state, with planned inputs."""
 
+import asyncio
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from service.live.position import Position
 from service.live.pulse import Beat
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
+from service.store.anomalies import WORDS
 from service.store.database import Database
 from service.store.models import Active
 from service.twins.registry import Entry
@@ -157,8 +159,7 @@ class Look:
 async def look_ahead(tracker: Known, database: Database, engine: Engine, request: ForecastRequest) -> Look:
     """Forecast from the present state; Refusal if there is none, or if the request asks for too much."""
     active, position = await state_of(tracker)
-    lag = await behind(tracker, database)
-    past = await past_of(tracker.twin, database, active, position)
+    lag, past = await asyncio.gather(behind(tracker, database), past_of(tracker.twin, database, active, position))
     task = build_task(tracker.twin, active, position, past, request)
     return Look(active, position, lag, await engine.forecast(active.document, task))
 
@@ -219,9 +220,17 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
         )
     if lag.quarantined:
         told.append(
-            f"{lag.quarantined} sample(s) ahead of the receive clock are in quarantine and take no part: its clock may be wrong"
+            "1 sample ahead of the receive clock is in quarantine and not used: its clock may be wrong"
+            if lag.quarantined == 1
+            else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
+
+
+def doubts(twin: Entry, open_kinds: Mapping[str, Sequence[str]]) -> list[str]:
+    """Say of which sensors the readings themselves are in doubt, from the kinds of the anomalies that last."""
+    found = [(name, kind) for name in twin.sensors for kind in open_kinds.get(name, []) if kind in ("stuck", "dropout")]
+    return [f"{name} {WORDS[kind]}; what the forecast says of it may be wrong" for name, kind in found]
 
 
 def render(twin: Entry, look: Look, quantiles: Sequence[float], limits: Sequence[Json]) -> Json:

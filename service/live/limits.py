@@ -15,7 +15,7 @@ from service.live.engine import Engine
 from service.live.tracker import Tracker
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
-from service.store.alarms import AlarmRow, Limit
+from service.store.alarms import FORECAST, MEASURED, AlarmRow, Limit
 from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import LeaseLost, TwinGone
@@ -40,7 +40,6 @@ MOST_PAST = 100_000
 """Of an archive that nobody has watched so far, so many of the newest samples are looked through."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 STEPS = 180
-MEASURED, FORECAST = "measured", "forecast"
 
 
 def limits_of(twin: Entry, origin: str) -> list[Limit]:
@@ -175,6 +174,7 @@ def foresee(
             news.append(alarms.end(connection, twin.key, known.id, from_us))
         elif not is_there and (known is not None or ahead.expected_s is not None):
             body = describe(limit, twin.units[limit.channel], from_us, ahead)
+            body["message"] += f", as of {format_instant(from_us // 1_000_000 * 1_000_000)}"  # read at any time after
             start_us = from_us if known is None else known.start_us
             row = alarms.write(connection, twin.key, limit, start_us, None, body)
             news += [] if row is None else [row]
@@ -206,7 +206,7 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
     def when(seconds: float | None) -> str | None:
         return None if seconds is None else format_instant(from_us + round(seconds) * 1_000_000)
 
-    bound = f"its {limit.colour} limit of {limit.bound:g} {unit or ''}".rstrip()
+    bound = _bound(limit, unit)
     if ahead.expected_s is None:
         first = "" if ahead.earliest_s is None else f" in {in_words(ahead.earliest_s)} at the earliest"
         message = f"{limit.channel} may reach {bound}{first}"
@@ -225,9 +225,12 @@ def _band(twin: Entry, limit: Limit) -> float:
 
 def _says(limit: Limit, unit: str | None, worst: float) -> str:
     where = "above" if limit.side == "high" else "below"
-    return f"{limit.channel} is {where} its {limit.colour} limit of {limit.bound:g} {unit or ''}".rstrip() + (
-        f": {worst:.4g} at worst"
-    )
+    return f"{limit.channel} is {where} {_bound(limit, unit)}: {worst:.4g} at worst"
+
+
+def _bound(limit: Limit, unit: str | None) -> str:
+    """Return a limit as an operator says it."""
+    return f"its {limit.colour} limit of {limit.bound:g} {'°C' if unit == 'degC' else unit or ''}".rstrip()
 
 
 def _told(connection: Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:

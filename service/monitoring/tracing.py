@@ -34,6 +34,11 @@ def use(provider: Any | None) -> None:
     _tracer = None if provider is None else provider.get_tracer(NAME)
 
 
+def is_on() -> bool:
+    """Return whether anybody asked for traces."""
+    return _tracer is not None
+
+
 @contextmanager
 def request(method: str, headers: Iterable[tuple[bytes, bytes]]) -> Iterator[Any]:
     """Trace a request, as a part of the caller's trace if its headers name one; yields the span, None without traces."""

@@ -27,7 +27,7 @@ RECENT = 12
 """So many of the last samples tell their usual distance, and whether they came live."""
 
 
-def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) -> Receipt:
+def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int, *, compacts: bool = True) -> Receipt:
     """Store what is new in a batch, and put into quarantine what lies ahead of the present.
 
     Parameters
@@ -36,12 +36,14 @@ def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) ->
         With the instants of its reception.
     tolerance_us
         By how much a clock may be fast; 0: whatever comes is stored.
+    compacts
+        See ``appending.append``.
     """
     if tolerance_us == 0 or not batch.time_us.size:
-        return appending.append(connection, twin, batch)
-    limit_us = int(batch.received.max()) + tolerance_us
-    if int(batch.time_us.max()) <= limit_us:
-        receipt = appending.append(connection, twin, batch)
+        return appending.append(connection, twin, batch, compacts=compacts)
+    limit_us = _greatest(batch.received) + tolerance_us
+    if _greatest(batch.time_us) <= limit_us:
+        receipt = appending.append(connection, twin, batch, compacts=compacts)
     else:
         receipt = _admit_some(connection, twin, batch, limit_us)
     if receipt.last_us is not None and receipt.last_us > limit_us and bool((batch.time_us <= limit_us).any()):
@@ -50,6 +52,11 @@ def admit(connection: Connection, twin: int, batch: Batch, tolerance_us: int) ->
             last_us = connection.execute("SELECT last_us FROM head WHERE twin = ?", (twin,)).fetchone()[0]
             return replace(receipt, moved=moved, last_us=last_us)
     return receipt
+
+
+def _greatest(instants: NDArray[np.int64]) -> int:
+    """Return the last of some instants; of one, without what looking through an array costs."""
+    return int(instants[0]) if instants.size == 1 else int(instants.max())
 
 
 def _admit_some(connection: Connection, twin: int, batch: Batch, limit_us: int) -> Receipt:

@@ -10,6 +10,8 @@ from service.store.connection import Connection
 from service.store.errors import Missing
 
 Json = dict[str, Any]
+MEASURED, FORECAST = "measured", "forecast"
+"""Where a limit is watched."""
 KEPT = 5000
 """Alarms that have ended are kept up to this number per twin, the newest."""
 
@@ -42,6 +44,16 @@ class AlarmRow:
         """Return whether an operator does not want to hear of it now."""
         return self.shelved_until_us is not None and self.shelved_until_us > at_us
 
+    @property
+    def message(self) -> str:
+        """What the alarm says, in the past tense once it is over."""
+        said = str(self.body["message"])
+        if self.stop_us is None:
+            return said
+        if self.limit.origin == MEASURED:
+            return said.replace(" is ", " was ", 1)
+        return said.replace(" reaches ", " was forecast to reach ", 1)
+
     def wire(self) -> Json:
         """Return the alarm as clients see it."""
         at_us = now_us()
@@ -58,6 +70,7 @@ class AlarmRow:
             "start": format_instant(self.start_us),
             "stop": None if self.stop_us is None else format_instant(self.stop_us),
             **self.body,
+            "message": self.message,
             "acknowledged": acknowledged,
             "shelved_until": format_instant(self.shelved_until_us or 0) if self.is_shelved(at_us) else None,
         }

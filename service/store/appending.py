@@ -11,7 +11,7 @@ from service.store.batch import Batch
 from service.store.blobs import matrix
 from service.store.connection import Connection, Head, Stage
 from service.store.errors import TwinGone
-from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, collapse, merge
+from service.store.merge import ACCEPTED, CONFLICT, QUARANTINED, Merge, collapse, merge
 from service.store.quarters import divided, quarter_of
 from service.store.segments import MOST_SMALL_CHUNKS, MOST_SMALL_ROWS, SMALL, WITHIN, within
 
@@ -27,13 +27,15 @@ in, and to read so many takes a millisecond."""
 class Receipt:
     """What became of a batch: (n_times,) status, the number of the first stored sample, the archive's last instant.
 
-    ``moved`` is how many samples that were stored before had to go into quarantine because of it.
+    ``moved`` is how many samples that were stored before had to go into quarantine because of it; ``is_crowded`` tells that
+    small segments wait to be compacted.
     """
 
     status: NDArray[np.int8]
     first_seq: int
     last_us: int | None
     moved: int = 0
+    is_crowded: bool = False
 
     @property
     def stored(self) -> NDArray[np.bool_]:
@@ -43,6 +45,8 @@ class Receipt:
     @cached_property
     def counts(self) -> list[int]:
         """How many samples have each status."""
+        if not self.status.any():
+            return [self.status.size, 0, 0, 0]
         counts: list[int] = np.bincount(self.status, minlength=QUARANTINED + 1).tolist()
         return counts
 
@@ -59,8 +63,8 @@ class Receipt:
         return conflicts
 
 
-def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
-    """Store what is new in a batch."""
+def append(connection: Connection, twin: int, batch: Batch, *, compacts: bool = True) -> Receipt:
+    """Store what is new in a batch; where small segments become many, they are compacted, or the receipt says so."""
     time_us = batch.time_us
     n = time_us.size
     if n == 1 or (n and bool((time_us[1:] > time_us[:-1]).all())):
@@ -73,9 +77,10 @@ def append(connection: Connection, twin: int, batch: Batch) -> Receipt:
         ends = (int(time_us[0]), int(time_us[-1]))
         head = _advance(connection, twin, batch, n, ends, after_all=True)
         if head is not None:
-            _write(connection, twin, batch, head, ends)
-            return Receipt(np.zeros(n, dtype=np.int8), head[0] - n + 1, int(time_us[-1]))
-    return _merge_in(connection, twin, batch)
+            is_crowded = _write(connection, twin, batch, head, ends, compacts=compacts)
+            status = np.zeros(n, dtype=np.int8)
+            return Receipt(status, head[0] - n + 1, int(time_us[-1]), is_crowded=is_crowded)
+    return _merge_in(connection, twin, batch, compacts=compacts)
 
 
 def _put(stage: Stage, head: Head, twin: int, batch: Batch, first_us: int) -> Receipt:
@@ -96,24 +101,30 @@ def _put(stage: Stage, head: Head, twin: int, batch: Batch, first_us: int) -> Re
     return Receipt(np.zeros(n, dtype=np.int8), first_seq, last_us)
 
 
-def _merge_in(connection: Connection, twin: int, batch: Batch) -> Receipt:
+def _merge_in(connection: Connection, twin: int, batch: Batch, *, compacts: bool) -> Receipt:
     """Store what is new in a batch that is late, unordered or empty."""
     row = connection.execute("SELECT seq, last_us FROM head WHERE twin = ?", (twin,)).fetchone()
     if row is None:
         raise TwinGone(f"twin {twin} is gone")
     if batch.time_us.size == 0:
         return Receipt(np.empty(0, dtype=np.int8), row[0] + 1, row[1])
-    fate = merge(*_around(connection, twin, batch), batch.time_us, batch.values)
-    kept = fate.status == ACCEPTED
-    if not kept.any():
-        return Receipt(fate.status, row[0] + 1, row[1])
-    stored = batch.take(kept)
-    ends = (int(stored.time_us.min()), int(stored.time_us.max()))
+    instants = np.unique(batch.time_us)
+    known = _around(connection, twin, batch, instants)
+    if known[0].size == 0 and instants.size == batch.time_us.size:  # nothing to be compared with
+        fate, stored = Merge(np.zeros(instants.size, dtype=np.int8), instants.size), batch
+        ends = (int(instants[0]), int(instants[-1]))
+    else:
+        fate = merge(*known, batch.time_us, batch.values)
+        kept = fate.status == ACCEPTED
+        if not kept.any():
+            return Receipt(fate.status, row[0] + 1, row[1])
+        stored = batch.take(kept)
+        ends = (int(stored.time_us.min()), int(stored.time_us.max()))
     head = _advance(connection, twin, stored, fate.n_instants, ends, after_all=False)
     if head is None:
         raise TwinGone(f"twin {twin} is gone")
-    _write(connection, twin, stored, head, ends)
-    return Receipt(fate.status, row[0] + 1, max(ends[1], row[1] or 0))
+    is_crowded = _write(connection, twin, stored, head, ends, compacts=compacts)
+    return Receipt(fate.status, row[0] + 1, max(ends[1], row[1] or 0), is_crowded=is_crowded)
 
 
 def _advance(
@@ -142,18 +153,30 @@ def _advance(
     return row
 
 
-def _write(connection: Connection, twin: int, batch: Batch, head: tuple[int, int, int], ends: tuple[int, int]) -> None:
-    """Write one chunk whose last sample has the head's number, and compact if there are many small ones."""
+def _write(
+    connection: Connection,
+    twin: int,
+    batch: Batch,
+    head: tuple[int, int, int],
+    ends: tuple[int, int],
+    *,
+    compacts: bool,
+) -> bool:
+    """Write one chunk whose last sample has the head's number; return whether there are many small ones, not compacted."""
     seq, small_chunks, small_rows = head
     n = int(batch.time_us.size)
     segments.insert(connection, twin, np.arange(seq - n + 1, seq + 1), batch, ends)
-    if small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS:
+    is_crowded = small_chunks >= MOST_SMALL_CHUNKS or small_rows >= MOST_SMALL_ROWS
+    if is_crowded and compacts:
         segments.compact(connection, {twin: batch.values.shape[0]})
+    return is_crowded and not compacts
 
 
-def _around(connection: Connection, twin: int, batch: Batch) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return what the archive holds at the instants of a batch, reading only the chunks that can hold any of them."""
-    instants, n_rows = np.unique(batch.time_us), batch.values.shape[0]
+def _around(
+    connection: Connection, twin: int, batch: Batch, instants: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return what the archive holds at the instants of a batch, in order, reading only the chunks that can hold any of them."""
+    n_rows = batch.values.shape[0]
     query = f"SELECT id, first_us, last_us FROM chunk WHERE {WITHIN}"
     overlapping = connection.execute(query, within(twin, int(instants[0]), int(instants[-1]) + 1)).fetchall()
     spans = np.array(overlapping, dtype=np.int64).reshape(-1, 3)

@@ -1,5 +1,7 @@
 """The database: one writer thread whose transactions many requests share, and readers that never wait for it.
 
+Where a commit is quicker than waking a thread twice, what is small is written by whoever brings it, in its turn.
+
 This is the narrow place through which all SQL goes: ``write(operation, ...)`` and ``read(operation, ...)``, where an
 operation is a function of a connection from one of the table modules. Which database it is, an ``Engine`` knows.
 """
@@ -7,6 +9,7 @@ operation is a function of a connection from one of the table modules. Which dat
 import asyncio
 import queue
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -26,6 +29,10 @@ SHARE = 256
 READERS = 4
 ATTEMPTS = 4
 """So often is a transaction run that others stood in the way of."""
+QUICK_S = 0.001
+"""What takes longer is worth a thread of its own."""
+RECENT = 32
+"""So many of the last writes tell how long one takes: each counts by this fraction, more the later it was."""
 
 
 @dataclass(slots=True)
@@ -62,6 +69,12 @@ class Database:
         self._session = self.engine.session()
         self._faults: tuple[type[Exception], ...] = (*self.engine.faults, Unavailable, DiskFull)
         self._orders: queue.SimpleQueue[_Order | None] = queue.SimpleQueue()
+        self._turn = threading.Lock()
+        """Held by whoever writes."""
+        self._is_writing = False
+        """Whether the writer has something at hand."""
+        self._usual_s = 4.0 * QUICK_S
+        """What a small write takes, of late; nothing is known of a disk at first."""
         self._readers = ThreadPoolExecutor(READERS, thread_name_prefix="reader")
         self._writer = threading.Thread(target=self._write_forever, name="writer", daemon=True)
         self._writer.start()
@@ -116,6 +129,29 @@ class Database:
         """The same for what belongs to a twin, see ``write_to``."""
         self._orders.put(_Order(lambda connection: operation(connection, *args, **kwargs), then, twin))
 
+    def submit_small(
+        self,
+        twin: int,
+        then: Callable[[T, BaseException | None], None],
+        operation: Callable[Concatenate[Connection, P], T],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """The same for what writes little: done, and ``then`` called, at once where nobody else writes and commits are quick."""
+        order = _Order(lambda connection: operation(connection, *args, **kwargs), then, twin)
+        is_alone = not self._is_writing and self._orders.empty()
+        if self._usual_s > QUICK_S or not is_alone or not self._turn.acquire(blocking=False):
+            self._orders.put(order)
+            return
+        try:
+            begun_s = time.perf_counter()
+            self._commit([order])
+            self._note(time.perf_counter() - begun_s)
+        finally:
+            self._turn.release()
+        if self._session.is_due:
+            self._orders.put(_Order(_nothing, _unheard))
+
     async def read(self, operation: Callable[Concatenate[Connection, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Run an operation on a read-only snapshot, beside the writer and other readers."""
         loop = asyncio.get_running_loop()
@@ -141,12 +177,17 @@ class Database:
         while not stop:
             orders, stop = self._collect()
             if orders:
-                self._commit(orders)
+                with self._turn:
+                    self._commit(orders)
+                    if self._session.is_due:
+                        self._session.catch_up()
+            self._is_writing = False
 
     def _collect(self) -> tuple[list[_Order], bool]:
         """Wait for one order, then take along what else is queued."""
         orders: list[_Order] = []
         item = self._orders.get()
+        self._is_writing = True
         while item is not None:
             orders.append(item)
             if len(orders) == SHARE:
@@ -196,8 +237,16 @@ class Database:
                 raise
             orders[0].error = self._refusal(error)
             return True
+        begun_s = time.perf_counter()
         session.commit()
+        if threading.current_thread() is self._writer:
+            self._note(time.perf_counter() - begun_s)
         return True
+
+    def _note(self, took_s: float) -> None:
+        """Learn how long a write took: of the writer, whose transactions may be large, the commit alone."""
+        if not self.is_shared:
+            self._usual_s += (took_s - self._usual_s) / RECENT
 
     def _commit_apart(self, orders: list[_Order]) -> None:
         self._session.begin(_twins(orders))
@@ -222,6 +271,14 @@ class Database:
 
     def _refusal(self, error: Exception) -> Exception:
         return self.engine.refusal(error) if isinstance(error, self.engine.faults) else error
+
+
+def _nothing(_: Connection) -> None:
+    """Let the writer look what there is to be done."""
+
+
+def _unheard(_: None, error: BaseException | None) -> None:
+    """Tell nobody."""
 
 
 def _twins(orders: list[_Order]) -> set[int]:

@@ -31,6 +31,13 @@ class Session(Protocol):
     def roll_back(self) -> None:
         """Undo it, if there is one; never raises."""
 
+    @property
+    def is_due(self) -> bool:
+        """Whether there is something that commits put off, which ``catch_up`` does."""
+
+    def catch_up(self) -> None:
+        """Do what commits put off, between two transactions; never raises."""
+
     def close(self) -> None:
         """Close the connection."""
 

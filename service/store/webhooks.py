@@ -147,8 +147,7 @@ def _told(kind: str, body: Mapping[str, Any]) -> tuple[Topic, str, str] | None:
     if kind == "anomaly":
         anomaly = body["anomaly"]
         ended = anomaly["stop"] is not None
-        text = f"{anomaly['sensor']} {anomaly.get('message') or anomaly['kind']}"
-        return "anomaly", "info" if ended else "warning", f"{text}{' (ended)' if ended else ''}"
+        return "anomaly", "info" if ended else "warning", f"{anomaly['message']}{' (ended)' if ended else ''}"
     if kind == "alarm":
         alarm = body["alarm"]
         if alarm["shelved_until"] is not None:

@@ -5,6 +5,7 @@ memory or else from the store, and a reader that lags too far is told so and mov
 """
 
 import asyncio
+import threading
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Sequence
 from functools import partial
@@ -86,7 +87,7 @@ class Hub:
     ) -> None:
         """Readers may lag ``buffer`` messages behind; ``hint`` hears of each twin to which something was written."""
         self._database, self._metrics, self._buffer, self._hint = database, metrics, buffer, hint
-        self._loop = asyncio.get_running_loop()
+        self._loop, self._thread = asyncio.get_running_loop(), threading.get_ident()
         self._topics: dict[int, Topic] = {}
         self._outcomes: deque[tuple[int, Then[Any], Made[Any], BaseException | None]] = deque()
 
@@ -141,6 +142,18 @@ class Hub:
         """The same, and let somebody hear in the event loop what came of it."""
         self._database.submit_to(twin, partial(self._after_commit, twin, then), operation, *args, **kwargs)
 
+    def submit_small(
+        self,
+        then: Then[T],
+        twin: int,
+        operation: Callable[Concatenate[Any, P], Made[T]],
+        *args: P.args,
+        **kwargs: P.kwargs,
+    ) -> None:
+        """The same for what writes little, from the event loop: see ``Database.submit_small``."""
+        self._database.submit_small(twin, partial(self._after_commit, twin, then), operation, *args, **kwargs)
+        self._take_outcomes()
+
     def _after_commit(self, twin: int, then: Then[Any], made: Made[Any], error: BaseException | None) -> None:
         """Hand an outcome to the event loop; the writer calls this in the order of the commits.
 
@@ -149,7 +162,7 @@ class Hub:
         if self._hint is not None and error is None:
             self._hint(twin)
         self._outcomes.append((twin, then, made, error))
-        if len(self._outcomes) == 1 and not self._loop.is_closed():
+        if len(self._outcomes) == 1 and threading.get_ident() != self._thread and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._take_outcomes)
 
     def _take_outcomes(self) -> None:

@@ -68,6 +68,8 @@ class Entry:
         rows = slice(first, first + values.shape[0])
         low, high = (limit[rows] for limit in self.limits)
         wrong = (values < low) | (values > high)  # NaN compares as neither
+        if not wrong.any():
+            return
         for row in np.flatnonzero(wrong.any(axis=1)).tolist():
             unit = self.units[self.channels[first + row]]
             wrong[row] &= ~marked(to_si(values[row], unit), unit)

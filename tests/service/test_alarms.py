@@ -73,7 +73,8 @@ def test_a_reading_beyond_a_limit_raises_an_alarm_that_ends_with_a_dead_band(cli
     assert (yellow["stop"], red["start"]) == (None, "1970-01-01T00:00:05Z")
     assert {row["colour"]: row["stop"] for row in (red, yellow)} == {"yellow": None, "red": "1970-01-01T00:00:07Z"}
     send(client, [9, 10], [299.0, 299.0])
-    alarms(client, 1, colour="yellow", stop="1970-01-01T00:00:09Z")
+    (over,) = alarms(client, 1, colour="yellow", stop="1970-01-01T00:00:09Z")
+    assert over["message"] == "T_px was above its yellow limit of 300 K: 312 at worst"
     told = [m["alarm"] for m in messages(client) if m["type"] == "alarm"]
     assert [(row["colour"], row["stop"] is None) for row in told] == [
         ("yellow", True),
@@ -92,6 +93,7 @@ def test_each_side_and_each_kind_of_channel(client: AppClient) -> None:
         ("Q_px", "red", "high", "W"),
     }
     assert [row["colour"] for row in rows] == ["red", "red", "yellow", "yellow"]
+    assert "T_tank is above its yellow limit of 40 °C: 42 at worst" in [row["message"] for row in rows]
     text = client.get("/metrics").text
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 2.0' in text
 
@@ -171,11 +173,13 @@ def test_a_forecast_alarm_gives_way_to_the_measured_one(client: AppClient, monke
     red, yellow = alarms(client, 2, on="forecast", stop=None)
     assert (red["colour"], yellow["colour"]) == ("red", "yellow")
     assert "reaches its yellow limit of 300 K in 16 min 40 s" in yellow["message"]
+    assert yellow["message"].endswith(", as of 1970-01-01T00:01:40Z")  # it is read at any time after
     assert yellow["expected"] == "1970-01-01T00:18:20Z"
     send(client, [101.0, 102.0], [301.0, 301.0])
     (measured,) = alarms(client, 1, on="measured")
     (ended,) = alarms(client, 1, on="forecast", stop="1970-01-01T00:01:42Z")
     assert (measured["colour"], ended["colour"]) == ("yellow", "yellow")
+    assert ended["message"].startswith("T_px was forecast to reach its yellow limit of 300 K in 16 min 40 s")
     alarms(client, 1, on="forecast", colour="red", stop=None)
 
 

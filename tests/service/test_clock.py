@@ -70,7 +70,7 @@ def test_frames_of_a_fast_clock_are_kept_apart_and_told(client: AppClient, ahead
     assert (found["last_time"], found["samples"], found["quarantined"]) == (iso(now + 1), 31, 3)
     ahead = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
     assert ahead["from"] == iso(now + 1) and ahead["values"]["T_px"]["mean"][0] == 290.0
-    assert any("3 sample(s)" in notice and "quarantine" in notice for notice in ahead["notices"])
+    assert any("3 samples ahead" in notice and "quarantine" in notice for notice in ahead["notices"])
     metrics = client.get("/metrics").text
     assert 'twin_ingest_samples_total{outcome="quarantined",twin="benchsat"} 3.0' in metrics
     (line,) = (row for row in metrics.splitlines() if row.startswith("twin_last_sample_timestamp_seconds{"))

@@ -1,5 +1,6 @@
 """The dashboard as a person uses it: real server, real Chromium, samples arriving, clicks and keys."""
 
+import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -115,6 +116,42 @@ def test_alarms_are_acknowledged_and_shelved(server: Server, page: Browser) -> N
     page.until("document.querySelector('#alarms .quietly')")
     page.click("#alarms button:last-of-type")
     page.until("!document.querySelector('#alarms .quietly')")
+    assert page.evaluate("document.querySelector('#now .big .over.warn').title") == "above its yellow limit of 295 K"
+    server.client().ingest("benchsat", [9003, 9004], {"T_px": [280.0, 280.0]})
+    page.until(
+        "document.querySelector('#alarms .past')?.innerText.includes('was above its yellow limit of 295 K: 297 at worst')"
+    )
+    page.until("!document.querySelector('#now .big .over')")
+    assert page.troubles == []
+
+
+def test_heat_of_a_found_effect_has_a_way_and_no_sign(server: Server, page: Browser) -> None:
+    """A leak that cools box, whose other end is bus, flows to bus, whichever end is named first."""
+    drawn = page.evaluate(
+        """(async () => {
+          const { NetworkDrawing } = await import("/assets/js/network.js");
+          const host = document.createElement("div");
+          document.body.append(host);
+          const drawing = new NetworkDrawing(host);
+          const picture = (effect) => ({
+            nodes: [{ id: "box", temperature_K: 300, heat_W: 0, sensed: true }], boundaries: [{ id: "bus", temperature_K: 290 }],
+            links: [], loads: [], effects: [effect] });
+          const found = [];
+          for (const [nodes, heat] of [[["box", "bus"], -10.8], [["box", "bus"], 10.8], [["bus", "box"], -10.8]]) {
+            const heat_W = { box: heat };
+            drawing.update(picture({ effect: "leak_to_boundary", where: { nodes }, heat_W }), "K");
+            const [bx, by] = drawing.places.get("box"), [sx, sy] = drawing.places.get("bus");
+            const head = host.querySelector(".effect-head").getAttribute("transform");
+            const turn = Number(/rotate\\(([^)]+)\\)/.exec(head)[1]) * Math.PI / 180;
+            const towards = Math.cos(turn) * (sx - bx) + Math.sin(turn) * (sy - by) > 0 ? "bus" : "box";
+            found.push(`${host.querySelector(".effect-label").textContent} to ${towards}`);
+          }
+          host.remove();
+          return JSON.stringify(found);
+        })()"""
+    )
+    label = "leak to boundary 10.8 W"
+    assert json.loads(drawn) == [f"{label} to bus", f"{label} to box", f"{label} to bus"]
     assert page.troubles == []
 
 

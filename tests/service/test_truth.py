@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.workbench.interface import DiagnosisTask, Outcome, Progress
-from tests.service.conftest import SPEC
+from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
 
@@ -126,3 +126,20 @@ def test_errors_in_one_list_are_of_one_measure(client: AppClient) -> None:
     client.request("DELETE", f"{TWIN}/telemetry", params={"start": 150})
     again = client.get(f"{TWIN}/models").json()["models"]
     assert {row["error"]["samples"] for row in again} == {150}
+
+
+def test_a_forecast_says_which_sensors_are_in_doubt(make_client: Any, sql: Sql) -> None:
+    client = make_client(workbench=FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    send(client, 0, [290.0 + 0.1 * k for k in range(100)], wobble(100))
+    run(client, "calibrations")
+    ahead = f"{TWIN}/forecast?horizon_s=10&step_s=1"
+    before = client.get(ahead).json()["notices"]
+    line = "T_tank is frozen: it repeats one reading; what the forecast says of it may be wrong"
+    assert line not in before
+    sql(
+        "INSERT INTO anomaly (twin, sensor, kind, start_us, stop_us, score, version)"
+        " VALUES (1, 'T_tank', 'stuck', 50000000, NULL, 9.0, 1), (1, 'T_px', 'stuck', 1, 2, 9.0, 1),"
+        " (1, 'T_px', 'residual', 1, NULL, 9.0, 1)"
+    )
+    assert client.get(ahead).json()["notices"] == [*before, line]

@@ -102,7 +102,7 @@ class Assumed:
         periods: dict[str, list[str]] = {}
         for name, rule in varying.items():
             if rule.period_s is not None:
-                periods.setdefault(f"{rule.period_s:.6g}", []).append(name)
+                periods.setdefault(f"{float(f'{rule.period_s:.4g}'):g}", []).append(name)
         parts = [
             f"{', '.join(names)} {'repeat their' if len(names) > 1 else 'repeats its'} last {s} s"
             for s, names in periods.items()

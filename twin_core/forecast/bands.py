@@ -162,6 +162,7 @@ def whole_path_factor(
     return np.maximum(np.quantile(worst, probability, axis=1), 1.0)
 
 
+@lru_cache(maxsize=2)
 def _noises(n_kept: int, n_draws: int, n_between: float) -> tuple[Float32Array, Float32Array]:
     """Return by how many standard deviations the largest of so many noises lies above, and one below, (n_kept, n_draws)."""
     if n_between <= 1.0:  # one reading: how far it lies above is how far it does not lie below

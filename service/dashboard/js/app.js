@@ -184,7 +184,7 @@ function renderNow() {
   const has_residual = (name) => state.residuals !== null && state.residuals.residual_K[name].some((v) => v !== null);
   const doubt = (name) => (state.detail.active_model === null ? standing() : has_residual(name) ? "" : underWay() || "no residual yet");
   const unit = unitShown(), { latest, ahead, anomalies, alarms } = state;
-  drawNow($("now"), { sensors: sensors(), units: units(), latest, ahead: ahead && ahead.values, unit, anomalies, alarms, doubt, telemetry: state.detail.telemetry });
+  drawNow($("now"), { sensors: sensors(), units: units(), limits: limitsByName(), latest, ahead: ahead && ahead.values, unit, anomalies, alarms, doubt, telemetry: state.detail.telemetry });
   $("now-note").textContent = ahead ? `${unitName(unit)}, expected in ${span(seconds(ahead.time.at(-1)) - seconds(ahead.from))}` : unitName(unit);
 }
 
@@ -192,7 +192,7 @@ function renderPlots() {
   const list = sensors(), unit = unitShown(), from = units();
   $("unit").textContent = unitName(unit);
   renderLegend(list);
-  drawAlarms($("alarms"), state.alarms.filter((a) => a.stop === null), { onAcknowledge: (a) => tell(a, "acknowledge"), onShelve: (a) => tell(a, "shelve", { for_s: a.shelved_until ? 0 : 3600 }) });
+  drawAlarms($("alarms"), state.alarms, { onAcknowledge: (a) => tell(a, "acknowledge"), onShelve: (a) => tell(a, "shelve", { for_s: a.shelved_until ? 0 : 3600 }) });
   drawAnomalies($("anomalies"), state.anomalies, list, standing(), (a) => zoomTo([seconds(a.start) - 1800, (a.stop ? seconds(a.stop) : seconds(state.detail.last_time)) + 1800]));
   const open = state.anomalies.filter((a) => a.stop === null).length;
   $("anomaly-note").textContent = open ? `${open} open` : "";
@@ -234,6 +234,8 @@ function renderTemperatures(list, unit, from) {
     ahead && ahead.behind_s > 0 ? `not from the present: ${span(ahead.behind_s)} behind the last sample` : "",
   ].filter(Boolean).join(" · ");
 }
+
+const limitsByName = () => Object.fromEntries(Object.entries(state.detail.specification.channels).map(([name, channel]) => [name, channel.limits]));
 
 function limits(list, unit, from) {
   return list.flatMap(({ name, index }) => Object.entries(state.detail.specification.channels[name].limits || {})

@@ -9,7 +9,7 @@ function axes(unit) {
   const common = { stroke: css("--muted"), font: "12px system-ui, sans-serif", grid, ticks: { show: false } };
   return [
     { ...common, grid: { show: false }, space: 90, values: (u, splits) => ticks(u, splits) },
-    { ...common, size: 58, label: unit, labelSize: 16, labelFont: "12px system-ui, sans-serif", values: (u, v) => v.map((x) => +x.toPrecision(6)) },
+    { ...common, size: 58, label: unit, labelSize: 16, labelFont: "12px system-ui, sans-serif", values: (u, v) => v.map((x) => String(+x.toPrecision(6)).replace("-", "−")) },
   ];
 }
 
@@ -273,7 +273,8 @@ export class InputChart extends Chart {
   update(view) {
     this.range = view.range;
     this.view = view;
-    const units = [...new Set(view.inputs.map((s) => s.unit))];
+    const uses = (unit) => view.inputs.filter((s) => s.unit === unit).length;
+    const units = [...new Set(view.inputs.map((s) => s.unit))].sort((a, b) => uses(b) - uses(a));
     const steps = uPlot.paths.stepped({ align: 1 }), scales = {};
     const tables = [[view.time, ...view.inputs.map((s) => view.values[s.name])]];
     const series = [{}, ...view.inputs.map((s) => this.series(s, steps, { width: 1.4 }))];
@@ -287,7 +288,29 @@ export class InputChart extends Chart {
     this.draw(JSON.stringify([view.inputs, css("--line"), view.planned !== null]), {
       series, axes: [time, side], plugins: [tooltip(this.host, (u, i) => this.rows(u, i))],
       scales: { x: { time: true, range: () => this.range }, ...scales },
+      hooks: { draw: [(u) => this.drawEnds(u, units.slice(1))] },
     }, tables.length > 1 ? uPlot.join(tables, tables.map((t) => t.slice(1).map(() => 1))) : tables[0]);
+  }
+
+  // Of the units that have no axis, the ends of what is shown, at the right margin.
+  drawEnds(u, units) {
+    const { ctx, bbox } = u, dot = devicePixelRatio;
+    ctx.save();
+    ctx.font = `${10.5 * dot}px system-ui, sans-serif`;
+    let right = bbox.left + bbox.width - 4 * dot;
+    for (const unit of units) {
+      const shown = u.series.map((s, i) => (i && s.show && s.scale === `in ${unit}` ? i : 0)).filter(Boolean);
+      const [first, last] = u.series[0].idxs || [0, u.data[0].length - 1];
+      const seen = shown.flatMap((i) => u.data[i].slice(first, last + 1)).filter((x) => x !== null && x !== undefined);
+      if (!seen.length) continue;
+      const ends = [...new Set([seen.reduce((a, b) => Math.max(a, b)), seen.reduce((a, b) => Math.min(a, b))])];
+      const texts = ends.map((x) => `${String(+x.toPrecision(3)).replace("-", "−")} ${unit || ""}`.trim());
+      const width = Math.max(...texts.map((text) => ctx.measureText(text).width));
+      ctx.fillStyle = u.series[shown[0]].stroke(u, shown[0]);
+      ends.forEach((x, i) => haloed(ctx, texts[i], right - width, u.valToPos(x, `in ${unit}`, true) + (i ? -3 : 4) * dot));
+      right -= width + 10 * dot;
+    }
+    ctx.restore();
   }
 
   series(s, steps, style) {

@@ -62,7 +62,7 @@ export class Fleet {
     this.drawTable(page.twins);
     this.drawPager(page);
     const { sort } = this.asked;
-    this.note.textContent = sort === "attention" ? "what needs somebody comes first" : `by ${COLUMNS.find(([, key]) => key === sort)[0].toLowerCase()}`;
+    this.note.textContent = sort === "attention" ? "twins that need attention come first" : `by ${COLUMNS.find(([, key]) => key === sort)[0].toLowerCase()}`;
     if (focused) this.section.querySelector(`[data-key="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
     return undefined;
   }
@@ -97,7 +97,7 @@ export class Fleet {
       make("td", {}, ...limits.map(([n, c, name]) => make("span", { class: `chip ${c}` }, `${n} ${name}`))),
       make("td", { class: "ahead" }, ...this.ahead(twin.ahead)),
       make("td", {}, twin.open_anomalies ? make("span", { class: "chip warn" }, count(twin.open_anomalies)) : null),
-      make("td", { class: "model" }, twin.active_model === null ? make("span", { class: "sub" }, "none") : make("b", {}, `v${twin.active_model}`),
+      make("td", { class: "model" }, twin.active_model === null ? make("span", { class: "sub" }, "no model") : make("b", {}, `v${twin.active_model}`),
         twin.active_model === null ? null : make("span", { class: "sub after" }, span(twin.model_age_s))));
   }
 

@@ -28,7 +28,8 @@ export const count = (n) => n.toLocaleString("en-US");
 export function number(value, digits = 2) {
   if (value === null || value === undefined || !Number.isFinite(value)) return "–";
   const size = Math.abs(value);
-  return size !== 0 && (size < 1e-3 || size >= 1e6) ? value.toExponential(2) : value.toFixed(digits);
+  const text = size !== 0 && (size < 1e-3 || size >= 1e6) ? size.toExponential(2) : size.toFixed(digits);
+  return value < 0 && Number(text) !== 0 ? `−${text}` : text;
 }
 
 export const watts = (value) => {

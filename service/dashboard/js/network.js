@@ -169,16 +169,21 @@ export class NetworkDrawing {
 
   effect(effect) {
     const ends = effect.where.nodes || [effect.where.node, effect.where.sink || effect.where.boundary];
-    const total = Object.values(effect.heat_W)[0];
-    const label = `${effectWords({ effect: effect.effect, where: {} })}${total === undefined ? "" : ` ${watts(total)}`}`;
-    const heated = Object.keys(effect.heat_W).find((node) => this.places.has(node));
-    const [a, b] = [this.places.get(ends[0] || heated), this.places.get(ends[1])];
+    const heated = Object.keys(effect.heat_W).find((node) => this.places.has(node)), into_W = effect.heat_W[heated];
+    const figure = into_W === undefined ? "" : watts(Math.abs(into_W)), words = effectWords({ effect: effect.effect, where: {} });
+    const [first, second] = [ends[0] || heated, ends[1]], [a, b] = [this.places.get(first), this.places.get(second)];
     if (a && b) {
-      const { path, middle } = curve(a, b, -30);
-      return [draw("path", { d: path, class: "effect" }), draw("text", { x: middle[0], y: middle[1] - 6, class: "effect-label halo" }, label)];
+      const { path, middle: [x, y] } = curve(a, b, -30), parts = [draw("path", { d: path, class: "effect" })];
+      if (into_W) {  // heat flows to the heated end, or from the cooled one
+        const [from, to] = (heated === first) === into_W > 0 ? [b, a] : [a, b];
+        const turn = (Math.atan2(to[1] - from[1], to[0] - from[0]) * 180) / Math.PI;
+        parts.push(draw("path", { d: "M8 0L-6 6L-6 -6Z", class: "head effect-head", transform: `translate(${x} ${y}) rotate(${turn})` }));
+      }
+      return [...parts, draw("text", { x, y: y - 13, class: "effect-label halo" }, `${words} ${figure}`.trim())];
     }
     if (!a) return [];
-    return [draw("circle", { cx: a[0], cy: a[1], r: 33, class: "effect" }), draw("text", { x: a[0], y: a[1] - 48, class: "effect-label halo" }, label)];
+    const way = into_W ? `${into_W < 0 ? "↑" : "↓"} ${figure}` : figure;
+    return [draw("circle", { cx: a[0], cy: a[1], r: 33, class: "effect" }), draw("text", { x: a[0], y: a[1] - 48, class: "effect-label halo" }, `${words} ${way}`.trim())];
   }
 
   sink({ id, temperature_K }, unit) {

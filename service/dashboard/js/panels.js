@@ -3,9 +3,22 @@ import { clock, colour, count, effectWords, make, number, seconds, span, toUnit,
 
 const quiet = (text) => make("li", { class: "quiet" }, text);
 
-export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies, alarms, doubt, telemetry }) {
+// Which limit of its channel a value lies beyond, in a colour and in words; null if none.
+const beyondLimit = (value, limits) => {
+  for (const [look, style] of [["red", "bad"], ["yellow", "warn"]]) {
+    const [low, high] = (limits || {})[look] || [null, null];
+    if (high !== null && value > high) return { style, words: `above its ${look} limit of ${high}` };
+    if (low !== null && value < low) return { style, words: `below its ${look} limit of ${low}` };
+  }
+  return null;
+};
+
+export function drawNow(table, { sensors, units, limits, latest, ahead, unit, anomalies, alarms, doubt, telemetry }) {
   const open = new Set(anomalies.filter((a) => a.stop === null).map((a) => a.sensor));
-  const show = (value, from) => number(toUnit(value, from, unit), 2);
+  const judged = (value, name) => {
+    const over = beyondLimit(value, limits[name]), text = number(toUnit(value, units[name], unit), 2);
+    return over ? make("span", { class: `over ${over.style}`, title: `${over.words} ${unitName(units[name])}` }, text) : text;
+  };
   const SIGNS = { stuck: "frozen", quantised: "repeats itself", dropout: "does not report" };
   const silent = ({ state, age_s, signs }) => (state === "stale" ? `silent${age_s === null ? "" : ` for ${span(age_s)}`}` : signs.map((kind) => SIGNS[kind]).join(", "));
   const beyond = (name) => alarms.find((a) => a.channel === name && a.on === "measured" && a.stop === null && !a.shelved_until);
@@ -14,12 +27,12 @@ export function drawNow(table, { sensors, units, latest, ahead, unit, anomalies,
   const light = ([looks, words]) => make("span", { class: looks, role: "img", "aria-label": words, title: words });
   const head = make("tr", {}, ...["Sensor", "Now", "Expected", "Range until then", ""].map((text, i) => make("th", { class: i && i < 4 ? "num" : "" }, text)));
   const rows = sensors.map((sensor) => {
-    const { name } = sensor, from = units[name], next = ahead ? ahead[name] : null;
+    const { name } = sensor, next = ahead ? ahead[name] : null;
     return make("tr", {},
       make("td", {}, make("span", { class: "dot", style: `background:${colour(sensor.index)};margin-right:8px` }), name, silent(telemetry[name]) ? make("div", { class: "sub" }, silent(telemetry[name])) : ""),
-      make("td", { class: "num big" }, latest[name] === undefined ? "–" : show(latest[name], from)),
-      make("td", { class: "num" }, next ? show(next.mean.at(-1), from) : "–"),
-      make("td", { class: "num sub" }, next ? `${show(Math.min(...next.q05), from)} … ${show(Math.max(...next.q95), from)}` : ""),
+      make("td", { class: "num big" }, latest[name] === undefined ? "–" : judged(latest[name], name)),
+      make("td", { class: "num" }, next ? judged(next.mean.at(-1), name) : "–"),
+      make("td", { class: "num sub" }, ...(next ? [judged(Math.min(...next.q05), name), " … ", judged(Math.max(...next.q95), name)] : [])),
       make("td", {}, light(look(name))));
   });
   table.replaceChildren(make("thead", {}, head), make("tbody", {}, ...rows));
@@ -54,16 +67,23 @@ export function drawAnomalies(list, anomalies, sensors, standing, onPick) {
   }));
 }
 
-// Alarms that last: what is wrong in words, and what an operator can say to it.
+const MOST_OVER = 4;
+
+// Alarms that last, with what an operator can say to them, and the last ones that are over.
 export function drawAlarms(list, alarms, { onAcknowledge, onShelve }) {
-  list.hidden = !alarms.length;
-  list.replaceChildren(...alarms.map((alarm) => {
+  const lasting = alarms.filter((alarm) => alarm.stop === null);
+  const over = alarms.filter((alarm) => alarm.stop !== null && alarm.on === "measured").slice(0, MOST_OVER);
+  list.hidden = !lasting.length && !over.length;
+  list.replaceChildren(...lasting.map((alarm) => {
     const quietly = alarm.shelved_until !== null;
     return make("li", { class: `alarm ${quietly ? "quietly" : ""}` },
       make("div", { class: "row" }, make("span", { class: `chip ${alarm.colour === "red" ? "bad" : "warn"}` }, `${alarm.colour}${alarm.on === "forecast" ? ", forecast" : ""}`),
         alarm.acknowledged ? make("span", { class: "sub", title: alarm.acknowledged.note || "" }, "acknowledged") : make("button", { class: "small", onclick: () => onAcknowledge(alarm) }, "Acknowledge"),
         make("button", { class: "small", onclick: () => onShelve(alarm), title: quietly ? `until ${alarm.shelved_until}` : "hear nothing of this limit for an hour" }, quietly ? "Unshelve" : "Shelve 1 h")),
       make("div", { class: "message" }, `${alarm.message} · since ${clock(seconds(alarm.start))}`));
+  }), ...over.map((alarm) => {
+    const [start, stop] = [clock(seconds(alarm.start)), clock(seconds(alarm.stop))];
+    return make("li", { class: "past" }, make("div", { class: "message" }, `${alarm.message} · ${start} to ${stop.slice(0, 10) === start.slice(0, 10) ? stop.slice(11) : stop}`));
   }));
 }
 

@@ -47,11 +47,15 @@ async def forecast_as_is(
 
 async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> Response:
     tracker = service.live.state(twin)
-    silent_s = forecasts.silence_s(twin, await service.live.beats(twin))
-    look = await forecasts.look_ahead(tracker, service.database, service.live.engine, request)
+    ahead = forecasts.look_ahead(tracker, service.database, service.live.engine, request)
+    version = None if tracker.active is None else tracker.active.version
+    lasting = service.database.read(anomalies.open_kinds, twin.key, version)
+    look, beats, kinds = await asyncio.gather(ahead, service.live.beats(twin), lasting)
+    silent_s = forecasts.silence_s(twin, beats)
     expected = list(limits.expected(twin, look.position.time_us, look.made))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    document["notices"] += forecasts.doubts(twin, kinds)
     if missing := lacks(look.active.specification, twin.specification):
         what = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
         document["notices"].append(

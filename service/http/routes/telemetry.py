@@ -3,13 +3,13 @@
 import asyncio
 import logging
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Annotated, Any
 
 import numpy as np
 import orjson
 from fastapi import APIRouter, Path, Query, Request, Response
 from starlette.responses import StreamingResponse
-from starlette.routing import Route
 
 from service.archive import changes, export
 from service.archive.downsample import extremes
@@ -65,56 +65,75 @@ async def ingest(request: Request, twin: TwinName) -> Response:
     require(request, Role.ingest)
     refuse_unknown(request)
     service: Service = request.app.state.service
-    entry = await service.find(twin)
+    await service.find(twin)
     body = (await request.receive()).get("body", b"")  # whole: see Bodies
-    parse = _parser(request.headers.get("content-type", ""))
+    media = request.headers.get("content-type", "")
+    parse = parser_of(media)
+    if parse is None:
+        told = media.partition(";")[0].strip().lower()[:60]
+        raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{told}'")
+    return Response(await taken(service, twin, parse, body), media_type="application/json")
+
+
+Parser = Callable[[bytes, Units], Batch]
+
+
+OUTDATED = (BadField, TwinGone)
+"""What goes wrong where another process has given a twin channels, or put another one in its place."""
+
+
+async def taken(service: Service, twin: str, parse: Parser, body: bytes) -> bytes:
+    """Store what a body holds, all of it or nothing, and return the answer: what became of each sample."""
+    entry = await service.find(twin)
     try:
         return await _take(service, entry, body, parse)
-    except (BadField, TwinGone):
+    except OUTDATED:
         now = await service.find_now(twin)
         if now is entry:
             raise
-    return await _take(
-        service, now, body, parse
-    )  # another process has given it channels, or put it in place of another one
+    return await _take(service, now, body, parse)
 
 
-async def _take(service: Service, entry: Entry, body: bytes, parse: Callable[[bytes, Units], Batch]) -> Response:
-    """Store what a body holds, all of it or nothing, and answer what became of each sample."""
-    if len(body) > PARSE_APART_BYTES:
-        batch = await asyncio.to_thread(parse, body, entry.units)
-    else:
-        batch = parse(body, entry.units)
+async def _take(service: Service, entry: Entry, body: bytes, parse: Parser) -> bytes:
+    is_large = len(body) > PARSE_APART_BYTES
+    batch = await asyncio.to_thread(read, entry, parse, body) if is_large else read(entry, parse, body)
+    return report(await service.intake.store(entry, batch))
+
+
+def read(entry: Entry, parse: Parser, body: bytes) -> Batch:
+    """Return the samples of a body; BadField or Problem if any of it is malformed or cannot be true."""
+    batch = parse(body, entry.units)
     entry.refuse_implausible(batch.values)
-    receipt = await service.intake.store(entry, batch)
-    return Response(orjson.dumps(_report(receipt)), media_type="application/json")
+    return batch
 
 
-(ingesting,) = (route for route in router.routes if isinstance(route, Route))
-"""The route of ``ingest``, for a way past the framework."""
-
-
-def _parser(content_type: str) -> Callable[[bytes, Units], Batch]:
+@lru_cache(maxsize=64)
+def parser_of(content_type: str) -> Parser | None:
+    """Return what reads bodies of a type, None if nothing does."""
     media = content_type.partition(";")[0].strip().lower()
     if media == "application/json":
         return parse_columns
-    if media in (NDJSON, "application/ndjson", "application/jsonl"):
-        return parse_frames
-    raise Problem(415, f"content-type must be application/json or {NDJSON}, got '{media[:60]}'")
+    return parse_frames if media in (NDJSON, "application/ndjson", "application/jsonl") else None
 
 
-def _report(receipt: Receipt) -> dict[str, Any]:
+def report(receipt: Receipt) -> bytes:
+    """Return the answer that tells what became of each sample."""
+    return orjson.dumps(told_of(receipt))
+
+
+def told_of(receipt: Receipt) -> dict[str, Any]:
+    """Return what became of each sample."""
     counts = receipt.counts
     conflicts = receipt.conflicts if counts[CONFLICT] else []
-    report = {
+    told = {
         "accepted": counts[ACCEPTED],
         "duplicates": counts[DUPLICATE],
         "rejected": [{"index": index, "reason": "conflict"} for index in conflicts],
         "last_time": None if receipt.last_us is None else format_instant(receipt.last_us),
     }
     if counts[QUARANTINED]:
-        report["quarantined"] = [{"index": index, "reason": AHEAD} for index in receipt.quarantined]
-    return report
+        told["quarantined"] = [{"index": index, "reason": AHEAD} for index in receipt.quarantined]
+    return told
 
 
 @router.get("", dependencies=[reads], response_model=Archive)
@@ -213,7 +232,7 @@ async def release(service: Running, twin: NamedTwin, request: Interval | None = 
     receipt = await service.hub.write(twin.key, changes.release, twin, start_us, stop_us)
     service.live.arrived(twin)
     log.warning("samples were let out of quarantine", extra={"twin": twin.name, "n": int(receipt.status.size)})
-    return IngestReport(**_report(receipt))
+    return IngestReport(**told_of(receipt))
 
 
 @quarantine.delete("", dependencies=[operates])

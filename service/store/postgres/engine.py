@@ -148,6 +148,11 @@ class PostgresSession:
         except psycopg.Error:
             self._speaking.driver.close()
 
+    is_due = False
+
+    def catch_up(self) -> None:
+        """Do nothing: the server looks after its log itself."""
+
     def close(self) -> None:
         """Close the connection."""
         self._speaking.driver.close()

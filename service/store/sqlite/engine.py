@@ -18,9 +18,13 @@ from service.store.sqlite.vacuum import vacuum
 log = logging.getLogger("service.store")
 T = TypeVar("T")
 
+COMMITS = 128
+"""After so many commits the log is copied into the file; a commit does so itself only where it has become much longer, of few
+but large ones."""
+
 ALL = ("mmap_size = 268435456", "temp_store = MEMORY")
 READER = (*ALL, "query_only = ON")
-WRITER = (*ALL, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON")
+WRITER = (*ALL, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON", "wal_autocheckpoint = 4000")
 NEW_FILE = ("auto_vacuum = INCREMENTAL",)
 """How a connection is set up; what writes to a file is set where it must be: a full disk must stop no reader."""
 FULL = ("SQLITE_FULL", "SQLITE_IOERR_WRITE", "SQLITE_IOERR_FSYNC", "SQLITE_IOERR_SHMSIZE")
@@ -32,6 +36,8 @@ class SqliteSession:
     def __init__(self, connection: sqlite3.Connection) -> None:
         """Take over an open connection."""
         self.connection = connection
+        self._commits = 0
+        """Since the log was last copied into the file."""
 
     @property
     def in_transaction(self) -> bool:
@@ -48,12 +54,24 @@ class SqliteSession:
     def commit(self) -> None:
         """Make it durable."""
         self.connection.execute("COMMIT")
+        self._commits += 1
 
     def roll_back(self) -> None:
         """Undo it, if there is one."""
         if self.connection.in_transaction:
             with contextlib.suppress(sqlite3.Error):  # the commit's own error is the one to report
                 self.connection.execute("ROLLBACK")
+
+    @property
+    def is_due(self) -> bool:
+        """Whether the log has grown enough to be copied into the file, which no commit is to wait for."""
+        return self._commits >= COMMITS
+
+    def catch_up(self) -> None:
+        """Copy it, as far as no reader needs the file as it is."""
+        self._commits = 0
+        with contextlib.suppress(sqlite3.Error):  # a full disk is told by the next write
+            self.connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
     def close(self) -> None:
         """Close the connection."""

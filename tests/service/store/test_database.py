@@ -1,10 +1,14 @@
 """One writer for all: shared commits, isolated failures, readers beside it, migrations."""
 
 import asyncio
+import contextlib
 import resource
 import sqlite3
+import threading
 from collections.abc import Iterator
+from concurrent.futures import Future
 from pathlib import Path
+from types import SimpleNamespace
 
 import psycopg
 import pytest
@@ -13,6 +17,7 @@ from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import DiskFull, StoreError
 from service.store.sqlite import migrations
+from service.store.sqlite.engine import SqliteSession
 from tests.service.postgres import STORES, place_of
 
 
@@ -120,3 +125,95 @@ def test_a_full_disk_stops_neither_a_reader_nor_a_start(tmp_path: Path) -> None:
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         database.close()
+
+
+class Clock:
+    """A clock on which each durable commit takes as long as a test says."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, commit_s: float) -> None:
+        """Let the database read it."""
+        self.now_s, self.commit_s = 0.0, commit_s
+        commit = SqliteSession.commit
+
+        def taking_long(session: SqliteSession) -> None:
+            commit(session)
+            self.now_s += self.commit_s
+
+        monkeypatch.setattr(SqliteSession, "commit", taking_long)
+        monkeypatch.setattr("service.store.database.time", SimpleNamespace(perf_counter=lambda: self.now_s))
+
+
+def written_by(database: Database, count: int) -> list[str]:
+    """Return which thread made each of some small writes, one after the other."""
+    found = []
+    for number in range(count):
+        done, where = threading.Event(), []
+
+        def operation(connection: Connection, where: list[str] = where, number: int = number) -> int:
+            where.append(threading.current_thread().name)
+            connection.execute("INSERT INTO audit VALUES (NULL, ?, '', '', '', 0, '', '')", (number,))
+            return number
+
+        def then(result: int, error: BaseException | None, done: threading.Event = done, number: int = number) -> None:
+            assert (result, error) == (number, None)
+            done.set()
+
+        database.submit_small(1, then, operation)
+        assert done.wait(60)
+        database.submit(lambda connection: None).result()  # the writer has nothing at hand any more
+        found += where
+    return found
+
+
+def test_small_writes_are_made_where_they_come_from_while_commits_are_quick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch, 1e-4)
+    here = threading.current_thread().name
+    with contextlib.closing(Database(tmp_path / "twin.sqlite3")) as database:
+        first = written_by(database, 200)
+        assert first[0] == "writer"  # of a disk that nobody knows
+        assert here in first
+        clock.commit_s = 1.0
+        assert set(written_by(database, 40)[5:]) == {"writer"}
+        clock.commit_s = 1e-4
+        assert here in written_by(database, 400)
+        assert database.submit(lambda c: c.execute("SELECT count(*) FROM audit").fetchone()[0]).result() == 640
+
+
+def test_a_small_write_waits_for_those_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Clock(monkeypatch, 1e-4)
+    with contextlib.closing(Database(tmp_path / "twin.sqlite3")) as database:
+        written_by(database, 200)
+        begun, go_on, order = threading.Event(), threading.Event(), []
+
+        def slow(connection: Connection) -> None:
+            begun.set()
+            assert go_on.wait(60)
+            order.append("before")
+
+        before = database.submit(slow)
+        assert begun.wait(60)
+        after: Future[None] = Future()
+        database.submit_small(1, lambda _, error: after.set_result(None), lambda connection: order.append("small"))
+        assert not after.done()
+        go_on.set()
+        before.result(60)
+        after.result(60)
+        assert order == ["before", "small"]
+
+
+def test_a_small_write_that_fails_undoes_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Clock(monkeypatch, 1e-4)
+    with contextlib.closing(Database(tmp_path / "twin.sqlite3")) as database:
+        written_by(database, 200)
+        heard: list[BaseException | None] = []
+
+        def fails(connection: Connection) -> None:
+            connection.execute("DELETE FROM audit")
+            raise RuntimeError("no")
+
+        database.submit_small(1, lambda _, error: heard.append(error), fails)
+        database.submit(lambda connection: None).result()
+        assert [str(error) for error in heard] == ["no"]
+        assert database.submit(lambda c: c.execute("SELECT count(*) FROM audit").fetchone()[0]).result() == 200
