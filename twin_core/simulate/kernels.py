@@ -26,7 +26,7 @@ STEP_K = 1e-10
 N_FIXED, N_NEWTON = 6, 40
 CONTRACTION = 0.3
 """Fixed-point iterations that contract less than this, or take more, give way to Newton's method."""
-LEAST_CONTRACTION = 1e-4
+LEAST_CONTRACTION = 1e-2
 """One that was better by chance promises no more than this for the next step."""
 
 
