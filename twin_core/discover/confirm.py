@@ -167,11 +167,6 @@ def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:
     return np.concatenate([np.array(own, dtype=np.int64), *starts])
 
 
-def reduced(rich: Calibration, problem: Problem) -> FloatArray:
-    """Return the unknowns of a simpler problem at a richer calibration's values."""
-    return rich.optimum.unknowns[shared_unknowns(rich, problem)]
-
-
 def fitted_effects(effects: Sequence[Effect], values: dict[str, float]) -> tuple[Effect, ...]:
     """Return effects at the values of a fitted network."""
     return tuple(effect.at_parameters(values) for effect in effects)

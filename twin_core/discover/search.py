@@ -194,13 +194,43 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bo
         chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
     else:
         chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS, state.first))
-    return accept(state, _by_heat(state, [(effect,) for effect in chosen], n_tried), needed), rankings[0]
+    return _accept_settled(state, [(effect,) for effect in chosen], n_tried, needed), rankings[0]
 
 
 def _pairs_by_heat(state: Search, ranked: Sequence[Probe], needed: float) -> bool:
     """Extend by the two effects that innovations suggest together; False if none is supported."""
     pairs = _best_pairs(ranked, state.trial, needed)
-    return accept(state, _by_heat(state, pairs, max(state.n_named**2 // 2, 1)), needed)
+    return _accept_settled(state, pairs, max(state.n_named**2 // 2, 1), needed)
+
+
+def _accept_settled(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int, needed: float) -> bool:
+    """Keep the best option that passes, fitted until it settles; False if none does."""
+    before = state.trial
+    if not accept(state, _by_heat(state, options, n_tried), needed):
+        return False
+    _settle(state, before, n_tried)
+    return True
+
+
+def _settle(state: Search, before: Trial, n_tried: int) -> None:
+    """Fit the last finding from its open-loop optimum too, and go on from the likelier fit.
+
+    What is tried beside it is weighed against it: where its own fit ended early, anything is likelier.
+    """
+    finding = state.findings[-1]
+    settled = state.attempt(
+        partial(resettled, before, finding.judged.trial), f"{finding.judged.labels} from its optimum"
+    )
+    if settled is None or settled.fit.log_posterior <= finding.judged.trial.fit.log_posterior:
+        return
+    own = {effect.place for effect in finding.effects}
+    judged = replace(
+        finding.judged,
+        effects=tuple(effect for effect in settled.effects if effect.place in own),
+        evidence=weigh(before, settled, n_tried),
+        trial=settled,
+    )
+    state.findings[-1], state.trial = replace(finding, judged=judged), settled
 
 
 def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:

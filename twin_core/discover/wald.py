@@ -1,24 +1,34 @@
 """Wald test of effects: whether a record determines their size. Confounded ones fit well at many sizes."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.special import ndtri
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.covariance import trajectory_covariance
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration
-from twin_core.discover.confirm import Trial, extended, reduced, shared_unknowns
+from twin_core.discover.confirm import Trial, extended, shared_unknowns
+from twin_core.effects.base import Effect
+
+LESS = 0.1
+"""Share of an effect that is taken away where its whole leaves another model: without the radiation that carries most of a
+plate's heat, temperatures hang on a film that nothing tells beside it, and the radiation seems to have no size."""
 
 
 def least_wald_score(simple: Trial, rich: Trial) -> float:
     """Return by how many of its standard deviations what an effect does to the readings differs from nothing: the least told.
 
-    What it does is the difference of two open-loop trajectories, with it and without, all else alike. How certain that is
-    follows from the covariance of all unknowns by the delta method; the misfit that wanders counts as noise (Huber 1967). Both
-    are in units of each sensor's noise, rms over readings. A load with the period of a declared input, say, may have any size
-    if the capacity follows: its score is near one, however much likelier the readings are with it. That nobody knows how large
-    all heat flows are together does not count: two trajectories tell the same then.
+    What it does is the difference of two open-loop trajectories, with it and without, all else alike; or with it and with less
+    of it, whichever is told better: heat that adds up is told as well by both, one that other parameters hang on by a part of
+    it, and a limit that is never reached with less of it by the whole. How certain that is follows from the covariance of all
+    unknowns by the delta method; the misfit that wanders counts as noise (Huber 1967). Both are in units of each sensor's
+    noise, rms over readings. A load with the period of a declared input, say, may have any size if the capacity follows: its
+    score is near one, however much likelier the readings are with it. That nobody knows how large all heat flows are together
+    does not count: two trajectories tell the same then.
 
     Parameters
     ----------
@@ -41,18 +51,65 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     covariance = trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
     if not np.isfinite(covariance).all():
         raise ArithmeticError("the covariance of the effects is not finite")
-    known = {effect.place for effect in simple.effects}
-    others = [[e for e in rich.effects if e is not own] for own in rich.effects if own.place not in known]
-    problems = [extended(simple.fit.problem, rest) if rest else simple.fit.problem for rest in others]
     slopes = stacked_jacobian(
         calibration.problem,
         calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
     )
-    return min((_score(calibration, slopes, covariance, problem) for problem in problems), default=np.inf)
+    known = {effect.place for effect in simple.effects}
+    scores = []
+    for own in rich.present_effects:
+        if own.place not in known:
+            rest = [e for e in rich.effects if e.place != own.place]
+            others = _without(calibration, simple.fit.problem, rest), _with_less(calibration, own)
+            scores.append(max(_score(calibration, slopes, covariance, other) for other in others))
+    return min(scores, default=np.inf)
 
 
-def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, without: Problem) -> float:
-    """Return the score of what a problem lacks of a calibration.
+@dataclass(frozen=True)
+class _Other:
+    """A calibration without an effect, or with less of it.
+
+    Attributes
+    ----------
+    problem, unknowns
+        Its problem, of the same telemetry, and where it stands.
+    own : (n_unknowns,)
+        Which unknown of the calibration each follows.
+    slopes : (n_unknowns,)
+        By how much.
+    unsolved
+        The score where its balance has no solution.
+    """
+
+    problem: Problem
+    unknowns: FloatArray
+    own: IntArray
+    slopes: FloatArray
+    unsolved: float
+
+
+def _without(rich: Calibration, declared: Problem, rest: Sequence[Effect]) -> _Other:
+    """Return a calibration without the effect that is not among the rest."""
+    problem = extended(declared, rest) if rest else declared
+    own = shared_unknowns(rich, problem)
+    return _Other(problem, rich.optimum.unknowns[own], own, np.ones(own.size), np.inf)
+
+
+def _with_less(rich: Calibration, effect: Effect) -> _Other:
+    """Return a calibration with less of an effect, which is at its calibrated values."""
+    problem, unknowns = rich.problem, rich.optimum.unknowns.copy()
+    parameters = problem.network.parameters.at_free(unknowns[: problem.n_free])
+    less = parameters.updated({p.name: p.value for p in effect.shortened(1.0 - LESS).parameters()})
+    amplitudes = {f"{effect.label}.{q.name}" for q in effect.parameter_specs() if q.null is not None}
+    left = np.array([1.0 - LESS if name in amplitudes else 1.0 for name in parameters.free_names])
+    slopes = np.ones(unknowns.size)
+    slopes[: problem.n_free] = left * parameters.slopes(parameters.free) / less.slopes(less.free)
+    unknowns[: problem.n_free] = less.free
+    return _Other(problem, unknowns, np.arange(unknowns.size), slopes, 0.0)
+
+
+def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, other: _Other) -> float:
+    """Return the score of what a calibration has and another one lacks.
 
     Parameters
     ----------
@@ -62,20 +119,20 @@ def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, withou
         Derivatives of its predicted readings, in K.
     covariance : (n_unknowns, n_unknowns)
         Of its unknowns.
-    without
-        The problem that lacks something, of the same telemetry.
+    other
+        What lacks something.
     """
-    problem, optimum = rich.problem, rich.optimum
-    unknowns = reduced(rich, without)
-    fit = without.solve(unknowns)
+    optimum, noise_K = rich.optimum, rich.problem.noise_K
+    fit = other.problem.solve(other.unknowns)
     if not np.isfinite(fit.cost):
-        return np.inf
+        return other.unsolved
     done_K = np.concatenate(optimum.fit.predicted_K) - np.concatenate(fit.predicted_K)
     change = slopes.copy()
-    change[:, :, shared_unknowns(rich, without)] -= stacked_jacobian(without, without.jacobian_blocks(unknowns, fit))
+    jacobian = stacked_jacobian(other.problem, other.problem.jacobian_blocks(other.unknowns, fit))
+    change[:, :, other.own] -= jacobian * other.slopes
     valid = np.isfinite(np.concatenate(rich.residuals))
     variance_K2 = np.einsum("tsi,tsi->ts", change @ covariance, change)
-    squares, variances = (np.where(valid, a / problem.noise_K**2, 0.0).sum() for a in (done_K**2, variance_K2))
+    squares, variances = (np.where(valid, a / noise_K**2, 0.0).sum() for a in (done_K**2, variance_K2))
     return float(np.sqrt(squares / variances)) if squares > 0.0 else 0.0
 
 

@@ -737,3 +737,37 @@ def test_an_option_is_settled_that_may_become_likely(
     monkeypatch.setattr(trajectories, "weigh", lambda *arguments: Evidence(200.0, 0.0))
     found = trajectories._settled(Search(stub(), stub()), [option], 1, NEEDED)
     assert [j.trial for j in found] == ([settled] if is_settled else [])
+
+
+@pytest.mark.parametrize(
+    ("nats", "kept"),
+    [(None, "first"), (-1.0, "first"), (0.0, "first"), (JUST, "settled")],
+    ids=["no answer", "less likely", "as likely", "likelier"],
+)
+def test_a_finding_goes_on_from_the_likelier_of_its_fits(
+    monkeypatch: pytest.MonkeyPatch, nats: float | None, kept: str
+) -> None:
+    """What is tried beside it is weighed against that fit."""
+
+    def fitted(watts: float, log_posterior: float) -> Trial:
+        effect = REGISTRY["constant_heat_load"]({"node": "a"}, {"Q_W": watts})
+        trial = Stub((load("known"), effect))
+        trial.fit = cast(Any, SimpleNamespace(problem=Problem(3), log_posterior=log_posterior))
+        return cast(Trial, trial)
+
+    def resettled(simple: Trial, rich: Trial) -> Trial:
+        assert (simple, rich) == (before, first)
+        if nats is None:
+            raise np.linalg.LinAlgError
+        return fitted(2.0, nats)
+
+    before, first = stub(load("known")), fitted(1.0, 0.0)
+    monkeypatch.setattr(searching, "resettled", resettled)
+    monkeypatch.setattr(searching, "weigh", lambda simple, rich, n_tried: Evidence(70.0 + n_tried, 0.0))
+    found = Judged(first.effects[1:], Evidence(50.0, 0.0), first)
+    state = Search(first, before, findings=[Finding(found)])
+    searching._settle(state, before, 7)
+    (finding,) = state.findings
+    assert state.trial is finding.judged.trial
+    assert [e.values["Q_W"] for e in finding.effects] == [2.0 if kept == "settled" else 1.0]
+    assert finding.judged.evidence.log_bayes_factor == (77.0 if kept == "settled" else 50.0)

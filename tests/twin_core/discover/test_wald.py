@@ -7,6 +7,7 @@ from scipy.optimize import curve_fit
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.second_order import fit_network
+from twin_core.discover import wald
 from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects import REGISTRY
@@ -89,3 +90,66 @@ def test_a_load_with_the_period_of_a_declared_input_has_no_size(period_s: float,
     simple, rich = trials(effect, hidden, 3000.0)
     assert rich.fit.log_posterior > simple.fit.log_posterior + 50.0
     assert (least_wald_score(simple, rich) > score_needed(np.log(100.0))) == is_told
+
+
+PLATE_R_M2, PLATE_G, SIGMA = 0.05, 0.002, 5.670374419e-8
+
+
+def radiating_trials() -> tuple[Trial, Trial]:
+    """Return a plate with a film, as it is declared, and with the radiation that carries nearly all of its heat."""
+    power = 40.0 + 30.0 * np.sign(np.sin(2.0 * np.pi * TIME_S / 5000.0))
+    path = solve_ivp(
+        lambda t, x: (
+            (np.interp(t, TIME_S, power) - PLATE_G * (x - ROOM_K) - SIGMA * PLATE_R_M2 * (x**4 - ROOM_K**4)) / C
+        ),
+        (0.0, TIME_S[-1]),
+        [330.0],
+        t_eval=TIME_S,
+        rtol=1e-9,
+        atol=1e-9,
+        max_step=STEP_S,
+    )
+    measured = path.y[0] + 5.0 * NOISE_K * np.random.default_rng(2).standard_normal(N)
+    fit, calibration = fit_network(load_spec(SPEC), [Record(TIME_S, {"T": measured, "P": power}, None, "plate")])
+    simple = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    radiation = REGISTRY["radiation_to_sink"]({"node": "block", "sink": "room"}, {"R_m2": 0.03})
+    return simple, try_effects(simple, (radiation,), n_passes=12)
+
+
+def test_an_effect_that_carries_most_of_the_heat_has_a_size() -> None:
+    """Without the radiation the plate would hang on a film that nothing tells beside it."""
+    simple, rich = radiating_trials()
+    calibration = rich.calibration()
+    names = calibration.problem.network.parameters.free_names
+    covariance = wald.trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
+    deviation = dict(zip(names, np.sqrt(np.diag(covariance)), strict=False))
+    (own,) = (name for name in names if name.endswith("R_m2"))
+    slopes = wald.stacked_jacobian(
+        calibration.problem,
+        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
+    )
+    whole = wald._score(calibration, slopes, covariance, wald._without(calibration, simple.fit.problem, []))
+    assert deviation["G:block|room"] > 0.5
+    assert least_wald_score(simple, rich) == pytest.approx(1.0 / deviation[own], rel=0.2)
+    assert whole < 0.2 / deviation[own]
+
+
+@pytest.mark.parametrize("name", ["constant_heat_load", "input_gain"])
+def test_of_heat_that_adds_up_a_part_tells_what_the_whole_does(name: str) -> None:
+    where, values = {
+        "constant_heat_load": ({"node": "block"}, {"Q_W": 1.0}),
+        "input_gain": ({"channel": "P"}, {"g": 1.1}),
+    }[name]
+    simple, rich = trials(REGISTRY[name](where, values), np.full(N, 1.5), 3000.0)
+    calibration = rich.calibration()
+    covariance = wald.trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
+    slopes = wald.stacked_jacobian(
+        calibration.problem,
+        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
+    )
+    others = (
+        wald._without(calibration, simple.fit.problem, []),
+        wald._with_less(calibration, rich.present_effects[0]),
+    )
+    whole, part = (wald._score(calibration, slopes, covariance, other) for other in others)
+    assert part == pytest.approx(whole, rel=1e-3)

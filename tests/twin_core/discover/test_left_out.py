@@ -1,0 +1,94 @@
+"""Blocks predicted from the others: refits where one block alone tells a parameter, the linear move where it is the same."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from twin_core._typing import FloatArray
+from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.second_order import Calibration, fit_network
+from twin_core.discover import left_out
+from twin_core.discover.left_out import N_BLOCKS, OPENING_SHARE, blocked_errors
+from twin_core.network.spec_io import load_spec
+from twin_core.telemetry import Record
+
+STEP_S, N, ROOM_K, NOISE_K = 60.0, 320, 290.0, 0.05
+TIME_S = STEP_S * np.arange(N)
+SPEC = {
+    "twin": "block",
+    "boundaries": {"room": {"value_K": ROOM_K}},
+    "channels": {
+        "T": {"kind": "temperature", "unit": "K", "noise_std": NOISE_K},
+        "P": {"kind": "power", "unit": "W"},
+    },
+    "nodes": [{"id": "block", "sensor": "T", "capacity_J_per_K": {"guess": 400.0}}],
+    "conductors": [{"between": ["block", "room"], "conductance_W_per_K": {"guess": 1.0}}],
+    "loads": [{"channel": "P", "node": "block", "gain": {"value": 1.0}}],
+}
+
+
+def held_but_once() -> FloatArray:
+    """Return a power that is held but for one pulse: its block alone tells the capacity."""
+    return np.where((TIME_S >= 0.40 * TIME_S[-1]) & (TIME_S < 0.45 * TIME_S[-1]), 30.0, 10.0)
+
+
+def swinging() -> FloatArray:
+    """Return a power that swings in every block."""
+    return 10.0 + 8.0 * np.sin(2.0 * np.pi * TIME_S / 600.0)
+
+
+def calibrated(power_W: FloatArray) -> Calibration:
+    """Return a block that rests with its power at first, calibrated."""
+    capacity, conductance = 60.0, 0.8
+    fade, path = np.exp(-conductance * STEP_S / capacity), [ROOM_K + power_W[0] / conductance]
+    for power in power_W[:-1]:
+        rest_K = ROOM_K + power / conductance
+        path.append(rest_K + fade * (path[-1] - rest_K))
+    measured = np.array(path) + NOISE_K * np.random.default_rng(3).standard_normal(N)
+    _, calibration = fit_network(load_spec(SPEC), [Record(TIME_S, {"T": measured, "P": power_W}, None, "block")])
+    return calibration
+
+
+def refitted(calibration: Calibration) -> FloatArray:
+    """Return the error on each block after a refit to a record without it."""
+    problem, optimum = calibration.problem, calibration.optimum
+    (segment,), errors = problem.segments, []
+    edges = np.linspace(0, segment.measured_K.shape[0], N_BLOCKS + 1).astype(int)
+    rows = np.arange(segment.measured_K.shape[0])
+    for first, last in pairwise(edges.tolist()):
+        out = (rows >= first) & (rows < last) & (rows >= OPENING_SHARE * rows.size)
+        kept = replace(segment, measured_K=np.where(out[:, None], np.nan, segment.measured_K))
+        fit = minimise(replace(problem, segments=(kept,)), optimum.unknowns).fit
+        errors.append(float((((segment.measured_K - fit.predicted_K[0]) / problem.noise_K)[out] ** 2).sum()))
+    return np.array(errors)
+
+
+@pytest.mark.parametrize(
+    ("power_W", "n_refits"), [(held_but_once, 1), (swinging, 0)], ids=["told by one block", "told by all"]
+)
+def test_what_one_block_alone_tells_is_refitted(
+    monkeypatch: pytest.MonkeyPatch, power_W: Callable[[], FloatArray], n_refits: int
+) -> None:
+    calibration, calls = calibrated(power_W()), []
+
+    def counted(calibration: Calibration, out: object) -> float:
+        calls.append(out)
+        return predicted(calibration, out)
+
+    predicted = left_out._predicted
+    monkeypatch.setattr(left_out, "_predicted", counted)
+    found, expected = blocked_errors(calibration), refitted(calibration)
+    assert len(calls) == n_refits
+    assert np.abs(found - expected).max() <= 0.03 * expected.sum()
+
+
+def test_a_refit_that_fails_leaves_the_linear_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    calibration = calibrated(held_but_once())
+    monkeypatch.setattr(left_out, "_predicted", lambda calibration, out: np.inf)
+    failed = blocked_errors(calibration)
+    monkeypatch.setattr(left_out, "MISJUDGED", np.inf)
+    assert np.isfinite(failed).all()
+    np.testing.assert_array_equal(failed, blocked_errors(calibration))
