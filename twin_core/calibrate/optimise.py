@@ -2,6 +2,7 @@
 
 Where several parameters together leave the readings nearly as they are, the cost is a narrow curved valley, along which straight
 steps must be short. What a step bends away from its linear response corrects it (Transtrum and Sethna 2012, arXiv 1201.5885).
+What single events tell, a threshold or an instant, has no second derivative: there steps are straight and small falls count.
 """
 
 from dataclasses import dataclass
@@ -126,6 +127,7 @@ def minimise(
         equations = normal_equations(problem, x, fit)
     except NUMERICAL_FAILURES:
         return Optimum(x, fit, np.eye(x.size), "numerical_failure", 0)
+    is_smooth = not np.isfinite(problem.network.parameters.step_limits).any()
     n_readings = sum(int(segment.valid.sum()) for segment in problem.segments)
     damping, growth = 1e-3, 2.0
     status: Status = "iteration_limit"
@@ -136,8 +138,10 @@ def minimise(
             status = "deadline"
             break
         try:
-            enough = max(tolerance * fit.cost, LEAST_FALL_NATS * max(1.0, 2.0 * fit.cost / n_readings))
-            move = _move(problem, x, fit, equations, damping, enough)
+            enough = tolerance * fit.cost
+            if is_smooth:
+                enough = max(enough, LEAST_FALL_NATS * max(1.0, 2.0 * fit.cost / n_readings))
+            move = _move(problem, x, fit, equations, damping, enough if is_smooth else np.inf)
             if move.gain > LEAST_GAIN:
                 ahead = normal_equations(problem, x + move.step, move.fit)
         except NUMERICAL_FAILURES:
@@ -174,7 +178,10 @@ class _Move:
 def _move(
     problem: Problem, x: FloatArray, fit: Fit, equations: NormalEquations, damping: float, enough: float
 ) -> _Move:
-    """Return the damped step from a point, corrected for what it bends where that lowers the cost further."""
+    """Return the damped step from a point, corrected for what it bends where that lowers the cost further.
+
+    Steps that promise a fall of no more than ``enough`` are not corrected.
+    """
     hessian, gradient = equations.hessian, equations.gradient
     bounds = problem.step_bounds(x, LARGEST_STEP)
     step = bounded_step(partial(_step, damping=damping), hessian, gradient, *bounds)
