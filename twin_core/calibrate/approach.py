@@ -81,7 +81,15 @@ def approach(
     for _ in range(rounds):
         noise = np.hypot(problem.noise_K, CAUTION * before) / np.sqrt(stands_for)
         weighed = replace(problem, noise_K=noise)
-        found = minimise(weighed, x, near=fit, max_iterations=MAX_ITERATIONS, tolerance=tolerance, deadline=deadline)
+        found = minimise(
+            weighed,
+            x,
+            near=fit,
+            max_iterations=MAX_ITERATIONS,
+            tolerance=tolerance,
+            deadline=deadline,
+            accelerated=True,
+        )
         if found.status == "no_solution":
             break
         best, x, fit, iterations = found, found.unknowns, found.fit, iterations + found.iterations
@@ -90,7 +98,7 @@ def approach(
             break
         before = after
     if (CAUTION * misfit_K(problem, fit) < problem.noise_K).all():
-        found = minimise(problem, x, near=fit, deadline=deadline)
+        found = minimise(problem, x, near=fit, deadline=deadline, accelerated=True)
         if found.status != "no_solution":
             best, iterations = found, iterations + found.iterations
     return replace(best, iterations=iterations)

@@ -93,6 +93,7 @@ def minimise(
     max_iterations: int = 60,
     tolerance: float = 1e-7,
     deadline: float = NO_DEADLINE,
+    accelerated: bool = False,
 ) -> Optimum:
     """Minimise the cost of a problem.
 
@@ -110,6 +111,9 @@ def minimise(
         Stop when an accepted step lowers the cost by less than this share, or by what ``LEAST_FALL_NATS`` says.
     deadline
         On the clock of ``time.monotonic``: no step is begun afterwards.
+    accelerated
+        Whether a flat valley is followed to its end, at two or three times the work of a step: for a model that is to stay, not
+        for the many that a search only compares.
 
     Returns
     -------
@@ -141,7 +145,7 @@ def minimise(
             enough = tolerance * fit.cost
             if is_smooth:
                 enough = max(enough, LEAST_FALL_NATS * max(1.0, 2.0 * fit.cost / n_readings))
-            move = _move(problem, x, fit, equations, damping, enough if is_smooth else np.inf)
+            move = _move(problem, x, fit, equations, damping, enough if is_smooth and accelerated else np.inf)
             if move.gain > LEAST_GAIN:
                 ahead = normal_equations(problem, x + move.step, move.fit)
         except NUMERICAL_FAILURES:

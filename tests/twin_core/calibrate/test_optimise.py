@@ -54,7 +54,7 @@ def problem(start_m2: float) -> Problem:
 def test_radiation_beside_a_declared_conductor_is_told_from_any_start(factor: float) -> None:
     """Far too large, it drags the conductor to nothing with it, and has to bring it back."""
     p = problem(factor * AREA_M2)
-    optimum = minimise(p)
+    optimum = minimise(p, accelerated=True)
     found = p.network.with_values(p.values(optimum.unknowns)).parameters.as_dict()
     np.testing.assert_allclose(found["radiative_exchange(n0,n1).R_m2"], AREA_M2, rtol=0.05)
     np.testing.assert_allclose(found["G:n0|n1"], G[0], rtol=0.1)
@@ -97,7 +97,7 @@ def warmed_by_one_step() -> Problem:
 def test_a_curved_valley_is_followed_to_its_end() -> None:
     """SciPy's trust region, given the same residuals and Jacobian and as many evaluations as it likes, gets no lower."""
     p = warmed_by_one_step()
-    optimum = minimise(p)
+    optimum = minimise(p, accelerated=True)
     mean, std = p.prior()
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -131,6 +131,6 @@ def test_a_record_too_long_for_its_derivatives_is_fitted_without_them(monkeypatc
     p = problem(AREA_M2)
     monkeypatch.setattr("twin_core.calibrate.normal_equations.MOST_KEPT", 100)
     assert normal_equations(p, p.start(), p.solve(p.start())).slopes == ()
-    optimum = minimise(p)
+    optimum = minimise(p, accelerated=True)
     assert optimum.status == "converged"
     assert optimum.fit.cost < p.solve(p.start()).cost
