@@ -16,7 +16,7 @@ from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
-from twin_core.discover.confirm import Trial, mean_excess, resettled, try_effects, weigh
+from twin_core.discover.confirm import Evidence, Trial, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -159,7 +159,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         second = partial(extend_by_trajectory, by_trajectory, needed, seeds, n_together, fallback=fallback, known=known)
         return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
 
-    misfit = state.trial.misfit_share()
+    misfit = state.attempt(state.trial.misfit_share, "how much trajectories leave") or 0.0
     seen, sets = look([state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
     if together and sets and not seen and misfit >= TOGETHER_MISFIT_SHARE:
         beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
@@ -218,19 +218,19 @@ def _settle(state: Search, before: Trial, n_tried: int) -> None:
     What is tried beside it is weighed against it: where its own fit ended early, anything is likelier.
     """
     finding = state.findings[-1]
-    settled = state.attempt(
-        partial(resettled, before, finding.judged.trial), f"{finding.judged.labels} from its optimum"
-    )
-    if settled is None or settled.fit.log_posterior <= finding.judged.trial.fit.log_posterior:
+
+    def work() -> tuple[Trial, Evidence]:
+        trial = resettled(before, finding.judged.trial)
+        return trial, weigh(before, trial, n_tried)
+
+    settled = state.attempt(work, f"{finding.judged.labels} from its optimum")
+    if settled is None or settled[0].fit.log_posterior <= finding.judged.trial.fit.log_posterior:
         return
+    trial, evidence = settled
     own = {effect.place for effect in finding.effects}
-    judged = replace(
-        finding.judged,
-        effects=tuple(effect for effect in settled.effects if effect.place in own),
-        evidence=weigh(before, settled, n_tried),
-        trial=settled,
-    )
-    state.findings[-1], state.trial = replace(finding, judged=judged), settled
+    effects = tuple(effect for effect in trial.effects if effect.place in own)
+    judged = replace(finding.judged, effects=effects, evidence=evidence, trial=trial)
+    state.findings[-1], state.trial = replace(finding, judged=judged), trial
 
 
 def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tuple[Effect, ...]]:
