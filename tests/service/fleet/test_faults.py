@@ -131,8 +131,10 @@ class Cut:
                 while self.is_cut.is_set():
                     time.sleep(0.05)
                 target.sendall(piece)
-        source.close()
-        target.close()
+        for end in (source, target):  # closing alone tells nobody while the other thread waits for something to arrive
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+            end.close()
 
 
 class Network:

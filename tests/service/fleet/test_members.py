@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from service.fleet.ownership import Leases
+from service.jobs import outcome
 from service.running.member import Member
 from service.store import twins
 from service.store.ownership import SLOTS, Changed, Holding, slot_of
@@ -189,6 +190,41 @@ def test_an_owner_that_knew_of_a_twin_before_it_heard_of_it_hears_of_its_model(
     activate(other)
     may_hear.set()
     until(lambda: other.get(TWIN).json()["assimilation"]["done"] == 60, 90.0)
+
+
+def test_an_owner_that_tells_something_itself_still_hears_of_samples(
+    pair: tuple[AppClient, AppClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own message has the last number when it hears of samples that another process stored just before."""
+    applied, may_hear = Member._apply, threading.Event()
+
+    async def apply(self: Member, one: Changed) -> None:
+        if may_hear.is_set():
+            await applied(self, one)
+
+    may_hear.set()
+    monkeypatch.setattr(Member, "_apply", apply)
+    pair[0].post("/v1/twins", json=SPEC)
+    feed(pair[0], 0)
+    activate(pair[0])
+    until(lambda: any(follows(client) for client in pair))
+    owner = next(client for client in pair if follows(client))
+    other = pair[1] if owner is pair[0] else pair[0]
+    until(lambda: owner.get(TWIN).json()["assimilation"]["done"] == 60, 90.0)
+    may_hear.clear()
+    feed(other, 60, 10)
+    hub = owner.app.state.service.hub
+    owner.portal.call(hub.write, 1, outcome.tell, 1, [("stale", {"state": "live", "channels": [], "text": "heard"})])
+    may_hear.set()
+    tracker = owner.app.state.service.live.find(1)
+    until(
+        lambda: tracker.position is not None and tracker.position.n_samples == 70
+    )  # nobody asks, which would let it look
+
+
+def follows(client: AppClient) -> bool:
+    """Whether a process follows the first twin."""
+    return client.app.state.service.live.find(1) is not None
 
 
 def test_every_process_says_how_far_the_owner_is(pair: tuple[AppClient, AppClient]) -> None:
