@@ -97,7 +97,7 @@ class Member:
         service.follow(entry)
         if one.seq > service.hub.head(one.twin):
             service.hub.advance(one.twin, one.seq)
-        if before is None or before.seq != one.seq:  # a message of our own may have a later number than samples of others
+        if before is None or before.seq != one.seq:  # a message of our own may be later than samples of others
             service.live.arrived(entry)
         if before is not None and before.archive != one.archive:
             service.live.archive_changed(entry)
