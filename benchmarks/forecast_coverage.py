@@ -45,6 +45,7 @@ LEVELS = (0.05, 0.5, 0.95)
 MODES = ("plan", "auto", "hold")
 FLIGHT_SETS = {
     "chandra_psmc": ("chandra-psmc.yaml", "flight_a.csv"),
+    "funcube1": ("funcube1.yaml", "whole_orbit_2016-02-04.csv"),
     "flexhouse_prbs": ("flexhouse.yaml", "prbs_2009.csv"),
     "three_block_tue": ("three-block.yaml", "three_block_24h.csv"),
 }

@@ -247,8 +247,18 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     left += [removed for removed in [other.result()] if removed is not None]
     if not left or more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
         return ""
-    little = policy.REPEATABLE_SHARE * (mean_excess(simple) - mean_excess(judged.trial))
-    return SMALL_REMAINDER if max(left) <= min(little, policy.MOST_COARSENESS) else NO_LAW
+    return SMALL_REMAINDER if max(left) <= _little(simple, trial, max(left)) else NO_LAW
+
+
+def _little(simple: Trial, trial: Trial, removed: float) -> float:
+    """Return up to what variance a repeatable heat beside a name is little, in units of the sensors' noise.
+
+    That is a share of what the name removes, and no more than a coarse network may leave, or than as large a share of what stays
+    beside either: where a model misses so much else, a law is not told wrong by less.
+    """
+    stays = mean_excess(trial) - removed
+    share = policy.REPEATABLE_SHARE
+    return min(share * (mean_excess(simple) - mean_excess(trial)), max(policy.MOST_COARSENESS, share * stays))
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

@@ -9,7 +9,7 @@ from math import comb
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.errors import ModelError
 from twin_core.gp.checked import whole
 
@@ -125,14 +125,27 @@ class Basis:
 
     def at_scaled(self, scaled: FloatArray) -> FloatArray:
         """Return the terms at x and z (2, ...), (..., n_terms)."""
-        return np.stack([scaled[0] ** a * scaled[1] ** b for a, b in self.exponents], axis=-1)
+        (by_x, by_z), (a, b) = self._powers(scaled), self._exponents
+        return np.moveaxis(by_x[a] * by_z[b], 0, -1)
 
-    def slopes(self, scaled: FloatArray) -> FloatArray:
-        """Return the derivatives of the terms in x and in z at x and z (2, n), (2, n, n_terms)."""
-        x, z = scaled
-        by_x = [a * x ** max(a - 1, 0) * z**b for a, b in self.exponents]
-        by_z = [b * x**a * z ** max(b - 1, 0) for a, b in self.exponents]
-        return np.stack([np.stack(by_x, axis=-1), np.stack(by_z, axis=-1)])
+    def gradient(self, scaled: FloatArray, coefficients: FloatArray) -> FloatArray:
+        """Return the derivatives of a polynomial of (n_terms,) coefficients in x and in z at x and z (2, n), (2, n)."""
+        (by_x, by_z), (a, b) = self._powers(scaled), self._exponents
+        in_x = (coefficients * a) @ (by_x[np.maximum(a - 1, 0)] * by_z[b])
+        in_z = (coefficients * b) @ (by_x[a] * by_z[np.maximum(b - 1, 0)])
+        return np.stack([in_x, in_z])
+
+    @cached_property
+    def _exponents(self) -> IntArray:
+        """Return the powers of x and of z of every term, (2, n_terms)."""
+        return np.array(self.exponents, dtype=np.int64).reshape(-1, 2).T
+
+    def _powers(self, scaled: FloatArray) -> FloatArray:
+        """Return the powers of x and z (2, ...) by products, (2, degree + 1, ...): ten times as fast as ``**``."""
+        powers = np.ones((2, self.degree + 1, *scaled.shape[1:]))
+        for k in range(self.degree):
+            np.multiply(powers[:, k], scaled, out=powers[:, k + 1])
+        return powers
 
     def taylor(self, scaled: FloatArray) -> FloatArray:
         """Return the Taylor coefficients dx^i dz^j of every term about x and z (2, n), (n, n_terms, degree + 1, same)."""

@@ -99,6 +99,19 @@ def test_everything_may_fail(base: Trial, monkeypatch: pytest.MonkeyPatch) -> No
     assert found.failures and all(failure.endswith("injected") for failure in found.failures)
 
 
+@pytest.mark.usefixtures("few_kinds")
+@pytest.mark.parametrize(
+    "path", ["twin_core.discover.search.resettled", "twin_core.discover.confirm.Trial.misfit_share"]
+)
+def test_what_settles_or_scales_a_finding_fails_alone(base: Trial, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
+    """Neither is a candidate's own fit: what was found before it stands, and the failure is listed."""
+    monkeypatch.setattr(path, failing(lambda *a, **k: None, 1, 1))
+    found = search(base, false_alarm_rate=0.01)
+    assert [effect.name for finding in found.findings for effect in finding.effects] == ["leak_to_boundary"]
+    assert all(failure.endswith("injected") for failure in found.failures)
+    assert found.failures or path.endswith("misfit_share")  # nobody asks what a trajectory leaves once heat has told
+
+
 def test_a_deadline_ends_the_search_with_the_best_so_far(base: Trial) -> None:
     found = search(base, false_alarm_rate=0.01, deadline=time.monotonic())
     assert found.trial is base and found.left_out

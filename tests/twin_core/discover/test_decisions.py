@@ -468,6 +468,18 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     assert judge._merely_resembles(simple, option, NEEDED) == ""
 
 
+def test_beside_much_that_stays_as_large_a_share_is_little(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What stays beside name and heat is no coarseness: a heat of a share of it does not tell the law wrong."""
+    option = judged("a", 90.0, left=100.0)
+    monkeypatch.setattr(judge, "acts_at", lambda *arguments: {"a"})
+    monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
+    at_most = REPEATABLE_SHARE * 100.0 / (1.0 + REPEATABLE_SHARE)
+    for removed, reason in ((at_most - JUST, SMALL_REMAINDER), (at_most + JUST, NO_LAW)):
+        monkeypatch.setattr(judge, "repeatable_heat", lambda *a, removed=removed: Repeatable(9e9, removed))
+        assert judge._merely_resembles(stub(left=9000.0), option, NEEDED) == reason
+
+
 def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
     """Only one that explains the readings better in its place speaks against it."""
     lag = REGISTRY["sensor_lag"]({"sensor": "T"}, {"tau_s": 30.0})
