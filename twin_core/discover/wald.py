@@ -62,7 +62,27 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
             rest = [e for e in rich.effects if e.place != own.place]
             others = _without(calibration, simple.fit.problem, rest), _with_less(calibration, own)
             scores.append(max(_score(calibration, slopes, covariance, other) for other in others))
+            scores += _scores_of_bounds(calibration, covariance, own)
     return min(scores, default=np.inf)
+
+
+def _scores_of_bounds(rich: Calibration, covariance: FloatArray, effect: Effect) -> list[float]:
+    """Return how many standard deviations lie between each value of a law and the bounds at which it breaks down.
+
+    Neither evidence nor score holds on a bound (Self and Liang 1987), and other parameters take such a law's place: a property
+    that comes to nothing within what the record visits is none.
+    """
+    network, n_free = rich.problem.network, rich.problem.n_free
+    names, values = network.parameters.free_names, network.parameters.at_free(rich.optimum.unknowns[:n_free]).as_dict()
+    found = []
+    for spec in effect.parameter_specs():
+        name = f"{effect.label}.{spec.name}"
+        if spec.breaks_down and name in names:
+            at = names.index(name)
+            value, std = values[name], float(np.sqrt(covariance[at, at]))
+            edges = [edge for edge in (spec.lower, spec.upper) if edge is not None]
+            found += [abs(value - edge) / std for edge in edges]
+    return found
 
 
 @dataclass(frozen=True)

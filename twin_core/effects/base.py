@@ -54,6 +54,8 @@ class ParameterSpec:
         Whether the data may tell no more than that it is large: a limit that was never reached.
     upper
         The greatest value, itself possible; None where there is none.
+    breaks_down
+        Whether the law comes to nothing at a bound, within what the record visits: a value that is not told from it is none.
     """
 
     name: str
@@ -67,6 +69,7 @@ class ParameterSpec:
     resolution: float = 0.0
     open_ended: bool = False
     upper: float | None = None
+    breaks_down: bool = False
 
     @property
     def transform(self) -> Transform:

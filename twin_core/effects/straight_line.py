@@ -29,4 +29,5 @@ def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: f
 
 def slope_quality(name: str, settings: Mapping[str, Any]) -> ParameterSpec:
     """Return the slope of a straight line as a parameter, within its range where a training record tells one."""
-    return ParameterSpec(name, "1/K", null=0.0, lower=settings.get("least_per_K"), upper=settings.get("most_per_K"))
+    lower, upper = settings.get("least_per_K"), settings.get("most_per_K")
+    return ParameterSpec(name, "1/K", null=0.0, lower=lower, upper=upper, breaks_down=True)

@@ -12,6 +12,7 @@ from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
+from twin_core.effects.straight_line import range_of_slope
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -153,3 +154,24 @@ def test_of_heat_that_adds_up_a_part_tells_what_the_whole_does(name: str) -> Non
     )
     whole, part = (wald._score(calibration, slopes, covariance, other) for other in others)
     assert part == pytest.approx(whole, rel=1e-3)
+
+
+@pytest.mark.parametrize(("share_at_room", "is_told"), [(0.5, True), (0.0, False)])
+def test_a_law_that_breaks_down_within_the_record_is_not_told(share_at_room: float, *, is_told: bool) -> None:
+    """A conductance that falls to nothing at the coldest reading lies on the bound of its law: another law is true there."""
+    mean_K = 0.5 * (294.0 + ROOM_K), 0.5 * (318.0 + ROOM_K)
+
+    def rate(t: float, x: FloatArray) -> FloatArray:
+        share = share_at_room + (1.0 - share_at_room) * (0.5 * (x + ROOM_K) - mean_K[0]) / (mean_K[1] - mean_K[0])
+        return np.asarray((np.interp(t, TIME_S, power_W(3000.0)) - G * share * (x - ROOM_K)) / C)
+
+    path = solve_ivp(rate, (0.0, TIME_S[-1]), [294.0], t_eval=TIME_S, rtol=1e-8, atol=1e-8, max_step=STEP_S)
+    measured = path.y[0] + NOISE_K * np.random.default_rng(5).standard_normal(N)
+    record = Record(TIME_S, {"T": measured, "P": power_W(3000.0)}, None, "block")
+    fit, calibration = fit_network(load_spec(SPEC), [record])
+    simple = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    reference_K = float(0.5 * (measured.mean() + ROOM_K))
+    settings = {"T_ref_K": reference_K, **range_of_slope(0.5 * (measured + ROOM_K), reference_K)}
+    effect = REGISTRY["conductance_temperature"]({"nodes": ("block", "room")}, {"beta_per_K": 1e-3}, settings)
+    rich = try_effects(simple, (effect,), n_passes=12)
+    assert (least_wald_score(simple, rich) > score_needed(4.6)) == is_told
