@@ -7,11 +7,12 @@ import os
 import socket
 import time
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.errors import Refusal, TooLittle, TooMuch
 from service.instants import parse_instant
@@ -19,7 +20,7 @@ from service.jobs import outcome
 from service.jobs.executor import Cancel, ExecutorLost, JobCancelled, JobFailed, Task, Tasks
 from service.jobs.outcome import Finished
 from service.monitoring.metrics import Metrics
-from service.store import jobs, models, selection
+from service.store import anomalies, jobs, models, selection
 from service.store.database import Database
 from service.store.errors import LeaseLost
 from service.store.jobs import Claim, JobRow
@@ -38,6 +39,8 @@ log = logging.getLogger("service.jobs")
 REPORT_EVERY_S = 0.3
 VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
+HOLDOUT_SHARE = 0.3
+"""The same of a diagnosis."""
 LEAST_VALIDATION = 20
 LEAST_SAMPLES = 20
 MOST_DERIVATIVES = 20_000_000
@@ -267,6 +270,9 @@ class Jobs:
         active = await self._database.read(models.active, twin.key)
         family = twin.specification.get("family")
         siblings = {} if family is None else await self._database.read(models.siblings, family, twin.name)
+        if held.kind == "diagnosis" and request.get("holdout") is None:
+            began_us = await self._database.read(anomalies.open_since, twin.key)
+            request = {**request, "holdout": usual_holdout(telemetry.time_us, began_us)}
         task, function = self._task(twin, held.kind, request, telemetry, active, siblings)
         future = self._executor.start(Task(work, (self._workbench, function, task), self._reporter(held), cancel))
         made = await asyncio.wrap_future(future)
@@ -374,3 +380,17 @@ def validation_start(telemetry: Telemetry, active_stop_us: int | None) -> int:
     if telemetry.time_us.size - position < LEAST_VALIDATION or position < LEAST_SAMPLES:
         return last + 1
     return cut
+
+
+def usual_holdout(time_us: NDArray[np.int64], began_us: Sequence[int]) -> float:
+    """Return what share of the time a diagnosis keeps back unless asked: no search finds what it was not shown.
+
+    Where an open anomaly began within the usual share, half of the time since the first of them is searched and half kept back.
+    """
+    first_us, last_us = int(time_us[0]), int(time_us[-1])
+    span_us = last_us - first_us
+    fresh = [began for began in began_us if last_us - HOLDOUT_SHARE * span_us < began < last_us]
+    if not fresh:
+        return HOLDOUT_SHARE
+    least_us = last_us - int(time_us[-min(LEAST_VALIDATION, time_us.size // 2)])
+    return min(max(0.5 * (last_us - min(fresh)), least_us) / span_us, HOLDOUT_SHARE)

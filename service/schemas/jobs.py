@@ -36,7 +36,9 @@ class CalibrationRequest(_Selecting):
 class DiagnosisRequest(_Selecting):
     """What a diagnosis uses and how much of it is held back for the score."""
 
-    holdout: Share = 0.3
+    holdout: Share | None = Field(
+        default=None, description="absent: 0.3, or half of the time since the first open anomaly that began within that"
+    )
     burn_in_s: Positive | None = None
     false_alarm_rate: Annotated[Number, Field(gt=0, lt=0.5)] = 0.01
     activate: bool = False

@@ -225,3 +225,10 @@ def open_kinds(connection: Connection, twin: int, version: int | None) -> dict[s
     for sensor, kind in connection.execute(query, (twin, version)):
         found.setdefault(sensor, []).append(kind)
     return found
+
+
+def open_since(connection: Connection, twin: int) -> list[int]:
+    """Return when the departures from the active model that last began."""
+    query = """SELECT start_us FROM anomaly WHERE twin = ? AND version = ? AND stop_us IS NULL AND kind IN ('residual', 'joint')
+               ORDER BY start_us"""
+    return [int(row[0]) for row in connection.execute(query, (twin, models.active_version(connection, twin)))]

@@ -120,6 +120,22 @@ def test_diagnosis_leaves_a_report_and_an_inactive_version(client: AppClient) ->
     assert model["effects"][0]["effect"] == "constant_heat_load"
 
 
+def test_a_diagnosis_that_says_nothing_keeps_less_back_beside_a_fresh_anomaly(client: AppClient) -> None:
+    feed(client, 1.0, count=1000)
+    finish(client, start(client))
+    assert finish(client, start(client, "diagnoses"))["result"]["holdout_share"] == 0.3
+
+    def open_one(connection: Any) -> None:
+        row = "1, 'T_px', 'residual', 899000000, NULL, 9.0, 1"
+        connection.execute(
+            f"INSERT INTO anomaly (twin, sensor, kind, start_us, stop_us, score, version) VALUES ({row})"
+        )
+
+    client.portal.call(client.app.state.service.database.write, open_one)
+    assert finish(client, start(client, "diagnoses"))["result"]["holdout_share"] == pytest.approx(50.0 / 999.0)
+    assert finish(client, start(client, "diagnoses", holdout=0.2))["result"]["holdout_share"] == 0.2
+
+
 def test_diagnosis_can_activate_and_finding_nothing_makes_no_version(client: AppClient) -> None:
     feed(client, 1.0)
     assert finish(client, start(client, "diagnoses", activate=True))["result"]["activated"] is True

@@ -297,6 +297,16 @@ def test_no_telemetry_is_refused() -> None:
         close_loop(tiny().spec, [])
 
 
+def test_what_begins_in_the_part_that_was_kept_back_is_said() -> None:
+    case = tiny()
+    late = case.record.time_s > np.quantile(case.record.time_s, 0.85)
+    jumped = {sensor: case.record.values[sensor] + 20.0 * late for sensor in case.spec.sensors}
+    changed = replace(case.record, values={**case.record.values, **jumped})
+    notices = [close_loop(case.spec, [record]).report["notices"] for record in (changed, case.record)]
+    told = [[notice for notice in some if "the part that was kept back fits" in notice] for some in notices]
+    assert len(told[0]) == 1 and not told[1]
+
+
 def test_a_held_out_error_that_does_not_fall_is_said() -> None:
     run = solved("radiation_to_sink")
     held = split_burn_in(run.case.record, None)

@@ -19,6 +19,8 @@ from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out,
 from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
 
+WORSE_THERE = 3.0
+"""So many times the error of the part that was searched is no chance of the part that was kept back: something differs there."""
 MOST_REJECTED = 8
 """Rows of what was tried and not supported."""
 
@@ -146,6 +148,17 @@ def _doubts(search: Search, scores: Sequence[Json]) -> list[str]:
     ]
 
 
+def _differs_there(score: Json, training_K: float) -> list[str]:
+    """Say that something may have begun in the part that was kept back, which no search has seen, if it fits far worse there."""
+    held_K = score["rmse_K"]
+    if held_K is None or not held_K > WORSE_THERE * training_K > 0.0:
+        return []
+    return [
+        f"the part that was kept back fits {held_K / training_K:.0f} times worse than what was searched ({held_K:.3g} K against "
+        f"{training_K:.3g} K): what began there was not looked for; if something may have changed, keep back less (holdout)"
+    ]
+
+
 def _left_out(search: Search) -> list[str]:
     """Return what the deadline cut off, in words."""
     if not search.left_out:
@@ -244,6 +257,7 @@ def build_report(
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
+            *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),
             *before.summary["notices"],
