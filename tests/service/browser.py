@@ -25,6 +25,16 @@ new MutationObserver((changes) => changes.forEach((change) => change.addedNodes.
 """
 """Remembers what a page says in passing: on a busy machine a toast has gone before anybody looks."""
 
+DRAWN = """
+window.drawn = new Set();
+const write = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...place) {
+  window.drawn.add(String(text));
+  return write.call(this, text, ...place);
+};
+"""
+"""Remembers what is written on canvases, which nobody can ask afterwards."""
+
 
 class Browser:
     """One page. Console errors and uncaught exceptions of the page are collected in ``troubles``."""
@@ -52,7 +62,7 @@ class Browser:
             raise
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
-        self.send("Page.addScriptToEvaluateOnNewDocument", source=TOASTS)
+        self.send("Page.addScriptToEvaluateOnNewDocument", source=TOASTS + DRAWN)
         self.resize(*self._size)
         return self
 
@@ -122,6 +132,10 @@ class Browser:
     def until_told(self, text: str) -> None:
         """Return once a toast has said something."""
         self.until(f"window.toasts.some((toast) => toast.includes({json.dumps(text)}))")
+
+    def until_drawn(self, text: str) -> None:
+        """Return once something is written on a canvas."""
+        self.until(f"window.drawn.has({json.dumps(text)})")
 
     def box(self, selector: str) -> tuple[float, float, float, float]:
         """Return left, top, width and height of an element."""

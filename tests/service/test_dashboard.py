@@ -110,6 +110,7 @@ def test_alarms_are_acknowledged_and_shelved(server: Server, page: Browser) -> N
     server.client().ingest("benchsat", [9000, 9001, 9002], {"T_px": [290.0, 296.0, 297.0]})
     page.until("document.getElementById('alarms').innerText.includes('above its yellow limit of 295 K')")
     page.until("document.querySelector('#now .state.warn').title === 'above its yellow limit'")
+    page.until_drawn("T_px yellow")  # the limit's line in the plot
     page.click("#alarms button:first-of-type")
     page.until("document.getElementById('alarms').innerText.includes('acknowledged')")
     page.click("#alarms button:last-of-type")
@@ -165,6 +166,7 @@ def test_inputs_limits_plans_and_files(server: Server, page: Browser) -> None:
     server.client().ingest("benchsat", times, {**values, "mode": [float(k // 100) for k in range(200)]})
     page.until("document.querySelector('#inputs canvas')")
     assert page.text("#input-legend").split() == ["Q_px", "mode"]
+    page.until_drawn("mode 1")  # the change of mode is marked in the plot
     page.click("#input-legend button:last-child")
     assert (
         page.evaluate("document.querySelector('#input-legend button:last-child').getAttribute('aria-pressed')")
