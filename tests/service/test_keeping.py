@@ -164,6 +164,7 @@ def test_webhooks_are_signed_tried_again_and_given_up(
     client = make_client(FakeWorkbench)
     made = client.post("/v1/webhooks", json={"url": receiver.url}).json()
     assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
+    client.post("/v1/twins", json={**SPEC, "twin": "another"})
     client.post("/v1/webhooks", json={"url": receiver.url, "twins": ["another"]})
     client.post("/v1/webhooks", json={"url": receiver.url, "types": ["job_failed"]})
     limits = {"yellow": [None, 295.0]}
@@ -196,9 +197,34 @@ def test_webhooks_are_signed_tried_again_and_given_up(
     assert client.get("/v1/webhooks/deliveries").json()["deliveries"] == []
 
 
-@pytest.mark.parametrize("url", ["ftp://x/y", "nowhere", "http://"])
+NO_URLS = [
+    "ftp://x/y",
+    "nowhere",
+    "http://",
+    "http://a b",
+    "http://a/b c",
+    "http://a:x",
+    "http://[::1",
+    "https:a",
+    "http:///x",
+]
+
+
+@pytest.mark.parametrize("url", NO_URLS)
 def test_webhooks_lead_somewhere(client: AppClient, url: str) -> None:
-    assert client.post("/v1/webhooks", json={"url": url}).status_code == 422
+    refused = client.post("/v1/webhooks", json={"url": url})
+    assert refused.status_code == 422 and [error["field"] for error in refused.json()["errors"]] == ["url"]
+
+
+def test_webhooks_hear_of_twins_that_exist(registered: AppClient) -> None:
+    hook = {"url": "http://127.0.0.1:9/hook?a=b"}
+    refused = registered.post("/v1/webhooks", json={**hook, "twins": ["benchsat", "nope"]})
+    assert refused.status_code == 422 and [error["field"] for error in refused.json()["errors"]] == ["twins[1]"]
+    assert "'nope'" in refused.json()["detail"]
+    for none in ({"twins": []}, {"types": []}):
+        assert registered.post("/v1/webhooks", json=hook | none).status_code == 422
+    made = registered.post("/v1/webhooks", json={**hook, "twins": ["benchsat"]})
+    assert made.status_code == 201 and made.json()["url"] == hook["url"]
 
 
 def test_silence_is_told_once_and_ends(registered: AppClient, sql: Sql) -> None:

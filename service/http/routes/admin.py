@@ -1,11 +1,10 @@
 """What concerns the service rather than a twin: the audit log and webhooks."""
 
 from typing import Annotated
-from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Path, Query
 
-from service.errors import BadField
+from service.errors import BadField, short
 from service.http.deps import Running, operates
 from service.schemas import (
     AuditLine,
@@ -20,6 +19,7 @@ from service.schemas import (
 )
 from service.store import audit as audit_table
 from service.store import webhooks as webhook_table
+from service.store.errors import Missing
 
 audit = APIRouter(prefix="/v1/audit", tags=["administration"])
 webhooks = APIRouter(prefix="/v1/webhooks", tags=["administration"])
@@ -41,9 +41,11 @@ async def list_audit(
 @webhooks.post("", status_code=201, dependencies=[operates])
 async def add(service: Running, request: WebhookRequest) -> WebhookMade:
     """Let a server hear of events; the answer has the secret that signs them, which is never shown again."""
-    parts = urlsplit(request.url)
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise BadField("url", "must begin with http:// or https:// and name a host")
+    for index, name in enumerate(request.twins or ()):
+        try:
+            await service.find_now(name)
+        except Missing:
+            raise BadField(f"twins[{index}]", f"there is no twin '{short(name)}'; register it first") from None
     made = await service.database.write(webhook_table.add, request.url, request.twins, request.types, request.secret)
     return WebhookMade(**made.wire(), secret=made.secret)
 
