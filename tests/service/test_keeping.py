@@ -97,6 +97,47 @@ def test_every_change_and_every_refused_key_is_on_record(make_client: Any, key_f
     assert older == lines[1:2]
 
 
+def test_the_audit_says_what_was_changed(client: AppClient) -> None:
+    changed = {**SPEC, "channels": {**SPEC["channels"], "T_new": {"kind": "temperature", "unit": "K"}}}
+    client.post("/v1/twins", json=SPEC)
+    client.post("/v1/twins", json=changed)  # refused: another one under its id
+    client.request("PUT", TWIN, json=changed)
+    client.request("PUT", TWIN, json=changed)
+    client.request("PUT", f"{TWIN}/retention", json={"samples_days": 30, "jobs": 9})
+    client.request("PUT", f"{TWIN}/retention", json={"samples_days": 1})
+    hook = {"url": "https://u:p4ss@chat.example.org:8443/h/t0ken", "types": ["limit", "stale"], "secret": "s" * 20}
+    number = client.post("/v1/webhooks", json=hook).json()["id"]
+    client.delete(f"/v1/webhooks/{number}")
+    lines = client.get("/v1/audit").json()["audit"]
+    assert [line["detail"] for line in reversed(lines)] == [
+        "benchsat, revision 1",
+        "benchsat",
+        "benchsat, revision 2",
+        "benchsat, revision 2 as before",
+        "samples_days all -> 30, jobs all -> 9",
+        "samples_days 30 -> 1, jobs 9 -> all",
+        f"webhook {number} at chat.example.org: limit, stale",
+        f"webhook {number} at chat.example.org: limit, stale",
+    ]
+
+
+def test_the_audit_says_which_model_and_which_job(make_client: Any) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    values = {"T_px": [296.0] * 30, "T_tank": [15.0] * 30, "Q_px": [0.5] * 30}
+    client.post(f"{TWIN}/telemetry", json={"time": list(range(30)), "values": values})
+    jobs = []
+    for _ in range(2):
+        made = client.post(f"{TWIN}/calibrations", json={"activate": False})
+        jobs.append(f"calibration {made.json()['id']}")
+        finish(client, made.headers["Location"])
+    for version in (1, 2):
+        client.post(f"{TWIN}/models/{version}/activate")
+    lines = client.get("/v1/audit").json()["audit"]
+    told = ["version none -> 1", "version 1 -> 2"]
+    assert [line["detail"] for line in reversed(lines)][1:] == [*jobs, *told]
+
+
 def test_strangers_cannot_fill_the_audit_log(make_client: Any) -> None:
     client = make_client(api_keys="operate:o")
     for _ in range(200):
