@@ -24,7 +24,9 @@ from service.live.silence import Silence
 from service.monitoring.logs import JsonLines
 from service.running import dispatch
 from service.settings import SettingsError, read_settings
-from service.store import schema
+from service.store import audit, schema
+from service.store.database import Database
+from service.store.sqlite import copies
 from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient, until
@@ -360,6 +362,27 @@ def test_a_migration_is_rehearsed_and_leaves_the_file_alone(tmp_path: Path, caps
     assert main(["migrate", "--rehearse", "--database", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == []
     assert main(["migrate", "--database", str(tmp_path / "none.sqlite3")]) == 2
+
+
+def test_only_the_owner_reads_the_database_and_its_copies(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, copy, elsewhere = (tmp_path / name for name in ("twin.sqlite3", "copy.sqlite3", "elsewhere.sqlite3"))
+    former = os.umask(0o022)
+    try:
+        database = Database(path)
+        database.submit(audit.append, 1, "anna", "POST", "/v1/twins", 201, "", "").result()
+        copies.backup(path, copy)
+        made = [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", ".lock")), copy]
+        assert [oct(one.stat().st_mode & 0o777) for one in made] == [oct(0o600)] * len(made)
+        database.close()
+        copies.restore(copy, elsewhere)
+        assert elsewhere.stat().st_mode & 0o777 == 0o600 and not caplog.records
+        path.chmod(0o640)
+        Database(path).close()  # somebody may have meant it
+        assert path.stat().st_mode & 0o777 == 0o640
+    finally:
+        os.umask(former)
+    (told,) = caplog.records
+    assert "webhooks" in told.message and told.mode == "0640"  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("url", ["sqlite:///:memory:", "sqlite:///file:x?mode=memory"])
