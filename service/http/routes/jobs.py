@@ -25,6 +25,9 @@ async def _start(
     start, stop = (None if request[n] is None else parse_instant(request[n], n) for n in ("start", "stop"))
     if start is not None and stop is not None and start >= stop:
         raise BadField("stop", "must come after start")
+    most_s = service.settings.job_deadline_s
+    if request["deadline_s"] is not None and request["deadline_s"] > most_s:
+        raise BadField("deadline_s", f"a job is ended after {most_s:g} s (TWIN_JOB_DEADLINE_S)")
     head = await service.database.read(twins.get, twin.name)
     if head.samples < LEAST_SAMPLES:
         raise Problem(
