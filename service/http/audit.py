@@ -54,10 +54,11 @@ class Audit:
     def _write(self, scope: Scope, method: str, path: str, status: int, *, refused: bool = False) -> None:
         state: dict[str, Any] = scope.get("state") or {}
         who, client = state.get("who", "unknown"), (scope.get("client") or ("", 0))[0]
-        line = (who, method, short(path, 200), status, client, short(scope["query_string"].decode("latin-1"), 200))
+        told = "; ".join(part for part in (scope["query_string"].decode("latin-1"), state.get("told")) if part)
+        line = (who, method, short(path, 200), status, client, short(told, 200))
         if refused:
             line = (*line[:5], "")  # a query may hold a key
-        names = ("who", "method", "path", "status", "client", "query")
+        names = ("who", "method", "path", "status", "client", "detail")
         log.info(
             "refused" if refused else "changed" if status < 400 else "not changed",
             extra=dict(zip(names, line, strict=True)),

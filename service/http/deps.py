@@ -3,7 +3,7 @@
 All of them are coroutines, although none waits: a plain function would be run in a thread, once per request each.
 """
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Annotated
 
 from fastapi import Depends, Path
@@ -68,6 +68,13 @@ def _parameters(dependant: Dependant) -> list[str]:
     return [*(parameter.alias for parameter in dependant.query_params), *inner]
 
 
+async def noted(connection: HTTPConnection) -> Callable[[str], None]:
+    """Return what the audit log's line of this request is told by: what the change was, and never a secret."""
+    state = connection.scope["state"]
+    return lambda told: state.update(told=told)
+
+
+Note = Annotated[Callable[[str], None], Depends(noted)]
 TwinName = Annotated[str, Path(description="Id of a registered twin.")]
 
 

@@ -1,8 +1,9 @@
 """The log of changes, and webhooks."""
 
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, HttpUrl, TypeAdapter, ValidationError
 
 from service.schemas.base import Answer, Instant, Request
 
@@ -30,12 +31,26 @@ WebhookEvent = Literal["anomaly", "limit", "stale", "model", "job_failed"]
 DeliveryState = Literal["waiting", "delivered", "dead"]
 
 
+_HTTP_URL = TypeAdapter(HttpUrl)
+
+
+def _leads_somewhere(url: str) -> str:
+    """Return the URL as it was sent; the parser alone would mend spaces, backslashes and a host that is missing."""
+    try:
+        _HTTP_URL.validate_python(url)
+    except ValidationError as error:
+        raise ValueError(f"must be a URL of http or https: {error.errors()[0]['msg']}") from None
+    if not url.isprintable() or " " in url or "\\" in url or not urlsplit(url).hostname:
+        raise ValueError("must begin with http:// or https://, name a host and hold no spaces")
+    return url
+
+
 class WebhookRequest(Request):
     """Where to send which events of which twins; null: all. Without a secret one is made."""
 
-    url: Annotated[str, Field(max_length=2000)]
-    twins: list[str] | None = None
-    types: list[WebhookEvent] | None = None
+    url: Annotated[str, Field(max_length=2000), AfterValidator(_leads_somewhere)]
+    twins: Annotated[list[str], Field(min_length=1)] | None = None
+    types: Annotated[list[WebhookEvent], Field(min_length=1)] | None = None
     secret: Annotated[str, Field(min_length=16, max_length=200)] | None = None
 
 

@@ -41,15 +41,28 @@ class Retention:
         """The same for the store."""
         return orjson.dumps({name: value for name, value in asdict(self).items() if value is not None}).decode()
 
+    def changes(self, former: "Retention") -> str:
+        """Return what another one stands in for, such as ``samples_days 30 -> 1``."""
+        pairs = ((name, was, asdict(self)[name]) for name, was in asdict(former).items())
+        return (
+            ", ".join(f"{name} {_said(was)} -> {_said(now)}" for name, was, now in pairs if was != now) or "as before"
+        )
+
+
+def _said(bound: float | None) -> str:
+    return "all" if bound is None else f"{bound:g}"
+
 
 def get(connection: Connection, twin: int) -> Retention:
     """Return the retention of a twin."""
     return Retention.of(connection.execute("SELECT retention FROM twin WHERE id = ?", (twin,)).fetchone()[0])
 
 
-def put(connection: Connection, twin: int, retention: Retention) -> None:
-    """Settle the retention of a twin."""
+def put(connection: Connection, twin: int, retention: Retention) -> Retention:
+    """Settle the retention of a twin; return the former one."""
+    former = get(connection, twin)
     connection.execute("UPDATE twin SET retention = ? WHERE id = ?", (retention.text, twin))
+    return former
 
 
 def sweep_gone(connection: Connection) -> int:

@@ -110,10 +110,11 @@ def select(connection: Connection) -> list[Webhook]:
     return [_hook(row) for row in connection.execute(_HOOKS + "ORDER BY id")]
 
 
-def remove(connection: Connection, number: int) -> None:
-    """Delete a webhook with its deliveries; Missing if there is none of that number."""
-    get(connection, number)
+def remove(connection: Connection, number: int) -> Webhook:
+    """Delete a webhook with its deliveries and return it; Missing if there is none of that number."""
+    hook = get(connection, number)
     connection.execute("DELETE FROM webhook WHERE id = ?", (number,))
+    return hook
 
 
 def enqueue(connection: Connection, twin: int, seq: int, time_us: int, kind: str, body: Mapping[str, Any]) -> None:

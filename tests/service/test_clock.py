@@ -167,7 +167,11 @@ def test_an_operator_may_let_samples_out_of_quarantine(client: AppClient) -> Non
     assert released.json()["accepted"] == 2 and released.json()["last_time"] == iso(ahead[2])
     assert (detail(client)["quarantined"], detail(client)["samples"]) == (2, 32)
     assert client.get(f"{TWIN}/residuals", params={"start": now + 1}).json()["time"] == [iso(t) for t in ahead[1:3]]
-    gone = client.delete(f"{TWIN}/quarantine").json()
+    for unclear in ({}, {"all": False}, {"all": True, "start": 5}):
+        refused = client.request("DELETE", f"{TWIN}/quarantine", params=unclear)
+        assert refused.status_code == 422 and "all=true" in refused.json()["detail"]
+    assert detail(client)["quarantined"] == 2
+    gone = client.request("DELETE", f"{TWIN}/quarantine", params={"all": True}).json()
     assert (gone["samples"], gone["place"], detail(client)["quarantined"]) == (2, "quarantine", 0)
     client.post(f"{TWIN}/telemetry/deletions/{gone['id']}/undo")
     assert (detail(client)["quarantined"], detail(client)["samples"]) == (2, 32)

@@ -184,6 +184,17 @@ def test_deadline(make_client) -> None:
     assert job["state"] == "failed" and "TWIN_JOB_DEADLINE_S" in job["message"]
 
 
+@pytest.mark.parametrize("jobs", ["calibrations", "diagnoses"])
+def test_no_search_is_longer_than_a_job_may_take(make_client, jobs: str) -> None:
+    client = make_client(workbench=FakeWorkbench, job_deadline_s=50.0)
+    client.post("/v1/twins", json=SPEC)
+    feed(client, 16)
+    refused = client.post(f"/v1/twins/benchsat/{jobs}", json={"deadline_s": 1e9})
+    assert refused.status_code == 422 and [error["field"] for error in refused.json()["errors"]] == ["deadline_s"]
+    assert "50 s (TWIN_JOB_DEADLINE_S)" in refused.json()["detail"]
+    assert client.post(f"/v1/twins/benchsat/{jobs}", json={"deadline_s": 50.0}).status_code == 202
+
+
 def test_stopping_the_service_ends_jobs_and_the_next_start_says_so(make_client) -> None:
     client = make_client(workbench=FakeWorkbench)
     client.post("/v1/twins", json=SPEC)

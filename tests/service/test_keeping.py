@@ -24,7 +24,9 @@ from service.live.silence import Silence
 from service.monitoring.logs import JsonLines
 from service.running import dispatch
 from service.settings import SettingsError, read_settings
-from service.store import schema
+from service.store import audit, schema
+from service.store.database import Database
+from service.store.sqlite import copies
 from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient, until
@@ -97,6 +99,47 @@ def test_every_change_and_every_refused_key_is_on_record(make_client: Any, key_f
     assert older == lines[1:2]
 
 
+def test_the_audit_says_what_was_changed(client: AppClient) -> None:
+    changed = {**SPEC, "channels": {**SPEC["channels"], "T_new": {"kind": "temperature", "unit": "K"}}}
+    client.post("/v1/twins", json=SPEC)
+    client.post("/v1/twins", json=changed)  # refused: another one under its id
+    client.request("PUT", TWIN, json=changed)
+    client.request("PUT", TWIN, json=changed)
+    client.request("PUT", f"{TWIN}/retention", json={"samples_days": 30, "jobs": 9})
+    client.request("PUT", f"{TWIN}/retention", json={"samples_days": 1})
+    hook = {"url": "https://u:p4ss@chat.example.org:8443/h/t0ken", "types": ["limit", "stale"], "secret": "s" * 20}
+    number = client.post("/v1/webhooks", json=hook).json()["id"]
+    client.delete(f"/v1/webhooks/{number}")
+    lines = client.get("/v1/audit").json()["audit"]
+    assert [line["detail"] for line in reversed(lines)] == [
+        "benchsat, revision 1",
+        "benchsat",
+        "benchsat, revision 2",
+        "benchsat, revision 2 as before",
+        "samples_days all -> 30, jobs all -> 9",
+        "samples_days 30 -> 1, jobs 9 -> all",
+        f"webhook {number} at chat.example.org: limit, stale",
+        f"webhook {number} at chat.example.org: limit, stale",
+    ]
+
+
+def test_the_audit_says_which_model_and_which_job(make_client: Any) -> None:
+    client = make_client(FakeWorkbench)
+    client.post("/v1/twins", json=SPEC)
+    values = {"T_px": [296.0] * 30, "T_tank": [15.0] * 30, "Q_px": [0.5] * 30}
+    client.post(f"{TWIN}/telemetry", json={"time": list(range(30)), "values": values})
+    jobs = []
+    for _ in range(2):
+        made = client.post(f"{TWIN}/calibrations", json={"activate": False})
+        jobs.append(f"calibration {made.json()['id']}")
+        finish(client, made.headers["Location"])
+    for version in (1, 2):
+        client.post(f"{TWIN}/models/{version}/activate")
+    lines = client.get("/v1/audit").json()["audit"]
+    told = ["version none -> 1", "version 1 -> 2"]
+    assert [line["detail"] for line in reversed(lines)][1:] == [*jobs, *told]
+
+
 def test_strangers_cannot_fill_the_audit_log(make_client: Any) -> None:
     client = make_client(api_keys="operate:o")
     for _ in range(200):
@@ -164,6 +207,7 @@ def test_webhooks_are_signed_tried_again_and_given_up(
     client = make_client(FakeWorkbench)
     made = client.post("/v1/webhooks", json={"url": receiver.url}).json()
     assert "secret" not in client.get("/v1/webhooks").json()["webhooks"][0]
+    client.post("/v1/twins", json={**SPEC, "twin": "another"})
     client.post("/v1/webhooks", json={"url": receiver.url, "twins": ["another"]})
     client.post("/v1/webhooks", json={"url": receiver.url, "types": ["job_failed"]})
     limits = {"yellow": [None, 295.0]}
@@ -196,9 +240,34 @@ def test_webhooks_are_signed_tried_again_and_given_up(
     assert client.get("/v1/webhooks/deliveries").json()["deliveries"] == []
 
 
-@pytest.mark.parametrize("url", ["ftp://x/y", "nowhere", "http://"])
+NO_URLS = [
+    "ftp://x/y",
+    "nowhere",
+    "http://",
+    "http://a b",
+    "http://a/b c",
+    "http://a:x",
+    "http://[::1",
+    "https:a",
+    "http:///x",
+]
+
+
+@pytest.mark.parametrize("url", NO_URLS)
 def test_webhooks_lead_somewhere(client: AppClient, url: str) -> None:
-    assert client.post("/v1/webhooks", json={"url": url}).status_code == 422
+    refused = client.post("/v1/webhooks", json={"url": url})
+    assert refused.status_code == 422 and [error["field"] for error in refused.json()["errors"]] == ["url"]
+
+
+def test_webhooks_hear_of_twins_that_exist(registered: AppClient) -> None:
+    hook = {"url": "http://127.0.0.1:9/hook?a=b"}
+    refused = registered.post("/v1/webhooks", json={**hook, "twins": ["benchsat", "nope"]})
+    assert refused.status_code == 422 and [error["field"] for error in refused.json()["errors"]] == ["twins[1]"]
+    assert "'nope'" in refused.json()["detail"]
+    for none in ({"twins": []}, {"types": []}):
+        assert registered.post("/v1/webhooks", json=hook | none).status_code == 422
+    made = registered.post("/v1/webhooks", json={**hook, "twins": ["benchsat"]})
+    assert made.status_code == 201 and made.json()["url"] == hook["url"]
 
 
 def test_silence_is_told_once_and_ends(registered: AppClient, sql: Sql) -> None:
@@ -293,6 +362,27 @@ def test_a_migration_is_rehearsed_and_leaves_the_file_alone(tmp_path: Path, caps
     assert main(["migrate", "--rehearse", "--database", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == []
     assert main(["migrate", "--database", str(tmp_path / "none.sqlite3")]) == 2
+
+
+def test_only_the_owner_reads_the_database_and_its_copies(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, copy, elsewhere = (tmp_path / name for name in ("twin.sqlite3", "copy.sqlite3", "elsewhere.sqlite3"))
+    former = os.umask(0o022)
+    try:
+        database = Database(path)
+        database.submit(audit.append, 1, "anna", "POST", "/v1/twins", 201, "", "").result()
+        copies.backup(path, copy)
+        made = [path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", ".lock")), copy]
+        assert [oct(one.stat().st_mode & 0o777) for one in made] == [oct(0o600)] * len(made)
+        database.close()
+        copies.restore(copy, elsewhere)
+        assert elsewhere.stat().st_mode & 0o777 == 0o600 and not caplog.records
+        path.chmod(0o640)
+        Database(path).close()  # somebody may have meant it
+        assert path.stat().st_mode & 0o777 == 0o640
+    finally:
+        os.umask(former)
+    (told,) = caplog.records
+    assert "webhooks" in told.message and told.mode == "0640"  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("url", ["sqlite:///:memory:", "sqlite:///file:x?mode=memory"])

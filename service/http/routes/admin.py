@@ -5,8 +5,8 @@ from urllib.parse import urlsplit
 
 from fastapi import APIRouter, Path, Query
 
-from service.errors import BadField
-from service.http.deps import Running, operates
+from service.errors import BadField, short
+from service.http.deps import Note, Running, operates
 from service.schemas import (
     AuditLine,
     AuditList,
@@ -20,6 +20,7 @@ from service.schemas import (
 )
 from service.store import audit as audit_table
 from service.store import webhooks as webhook_table
+from service.store.errors import Missing
 
 audit = APIRouter(prefix="/v1/audit", tags=["administration"])
 webhooks = APIRouter(prefix="/v1/webhooks", tags=["administration"])
@@ -39,12 +40,15 @@ async def list_audit(
 
 
 @webhooks.post("", status_code=201, dependencies=[operates])
-async def add(service: Running, request: WebhookRequest) -> WebhookMade:
+async def add(service: Running, request: WebhookRequest, note: Note) -> WebhookMade:
     """Let a server hear of events; the answer has the secret that signs them, which is never shown again."""
-    parts = urlsplit(request.url)
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise BadField("url", "must begin with http:// or https:// and name a host")
+    for index, name in enumerate(request.twins or ()):
+        try:
+            await service.find_now(name)
+        except Missing:
+            raise BadField(f"twins[{index}]", f"there is no twin '{short(name)}'; register it first") from None
     made = await service.database.write(webhook_table.add, request.url, request.twins, request.types, request.secret)
+    note(_named(made))
     return WebhookMade(**made.wire(), secret=made.secret)
 
 
@@ -56,9 +60,15 @@ async def list_webhooks(service: Running) -> WebhookList:
 
 
 @webhooks.delete("/{webhook}", status_code=204, dependencies=[operates])
-async def remove(service: Running, webhook: Number) -> None:
+async def remove(service: Running, webhook: Number, note: Note) -> None:
     """Delete a webhook; what was not delivered yet is dropped."""
-    await service.database.write(webhook_table.remove, webhook)
+    note(_named(await service.database.write(webhook_table.remove, webhook)))
+
+
+def _named(hook: webhook_table.Webhook) -> str:
+    """Return number, host and events of a webhook; the rest of its URL may hold a secret."""
+    events = "all events" if hook.types is None else ", ".join(hook.types)
+    return f"webhook {hook.id} at {urlsplit(hook.url).hostname}: {events}"
 
 
 @webhooks.get("/deliveries", dependencies=[operates])

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Response
 from starlette.responses import HTMLResponse
 
 from service.errors import BadField, short
-from service.http.deps import NamedTwin, Running, Service, operates, reads
+from service.http.deps import NamedTwin, Note, Running, Service, operates, reads
 from service.http.problems import Problem
 from service.instants import format_instant, parse_instant
 from service.jobs.runner import LEAST_SAMPLES
@@ -19,10 +19,15 @@ from service.twins.registry import Entry
 PAGE_POLICY = "default-src 'none'; img-src data:; font-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 
 
-async def _start(service: Service, twin: Entry, kind: JobKind, request: dict[str, Any], response: Response) -> Job:
+async def _start(
+    service: Service, twin: Entry, kind: JobKind, request: dict[str, Any], response: Response, note: Note
+) -> Job:
     start, stop = (None if request[n] is None else parse_instant(request[n], n) for n in ("start", "stop"))
     if start is not None and stop is not None and start >= stop:
         raise BadField("stop", "must come after start")
+    most_s = service.settings.job_deadline_s
+    if request["deadline_s"] is not None and request["deadline_s"] > most_s:
+        raise BadField("deadline_s", f"a job is ended after {most_s:g} s (TWIN_JOB_DEADLINE_S)")
     head = await service.database.read(twins.get, twin.name)
     if head.samples < LEAST_SAMPLES:
         raise Problem(
@@ -33,6 +38,7 @@ async def _start(service: Service, twin: Entry, kind: JobKind, request: dict[str
     if stop is not None and head.first_us is not None and stop <= head.first_us:
         raise BadField("stop", f"does not come after the first sample ({format_instant(head.first_us)})")
     row = await service.jobs.start(twin, kind, request)
+    note(f"{kind} {row.id}")
     rooms = {"calibration": "calibrations", "diagnosis": "diagnoses"}
     response.headers["Location"] = f"/v1/twins/{twin.name}/{rooms[kind]}/{row.id}"
     return Job(**row.wire())
@@ -75,21 +81,21 @@ async def _check_method(method: str) -> None:
 
 @calibrations.post("", status_code=202, dependencies=[operates])
 async def calibrate(
-    service: Running, twin: NamedTwin, response: Response, request: CalibrationRequest | None = None
+    service: Running, twin: NamedTwin, response: Response, note: Note, request: CalibrationRequest | None = None
 ) -> Job:
     """Recalibrate in the background; the new version becomes active if it is the first or the better one."""
     request = request or CalibrationRequest()
     await _check_method(request.method)
-    return await _start(service, twin, "calibration", request.model_dump(mode="json"), response)
+    return await _start(service, twin, "calibration", request.model_dump(mode="json"), response, note)
 
 
 @diagnoses.post("", status_code=202, dependencies=[operates])
 async def diagnose(
-    service: Running, twin: NamedTwin, response: Response, request: DiagnosisRequest | None = None
+    service: Running, twin: NamedTwin, response: Response, note: Note, request: DiagnosisRequest | None = None
 ) -> Job:
     """Close the loop on the archive: find what the model lacks, and score it on held-out telemetry."""
     settings = (request or DiagnosisRequest()).model_dump(mode="json")
-    return await _start(service, twin, "diagnosis", settings, response)
+    return await _start(service, twin, "diagnosis", settings, response, note)
 
 
 @diagnoses.get("/{job}/report.html", dependencies=[reads], response_class=HTMLResponse)

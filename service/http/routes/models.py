@@ -1,15 +1,18 @@
 """Model versions: list, inspect, activate, bring one along."""
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import orjson
 from fastapi import APIRouter, Body, Path
 from pydantic import AfterValidator
 
-from service.http.deps import NamedTwin, Running, operates, reads
+from service.http.deps import NamedTwin, Note, Running, operates, reads
 from service.jobs import outcome
 from service.schemas import Activation, ModelDetail, ModelInfo, ModelList
 from service.store import models, retention
+from service.store.connection import Connection
+from service.stream.messages import Stretch
 from service.twins.fit import refuse_foreign
 from twin_core import __version__
 from twin_core.network.spec_io import load_spec
@@ -52,11 +55,21 @@ async def inspect(service: Running, twin: NamedTwin, version: Version) -> ModelD
 
 
 @router.post("/{version}/activate", dependencies=[operates])
-async def activate(service: Running, twin: NamedTwin, version: Version) -> ModelInfo:
+async def activate(service: Running, twin: NamedTwin, version: Version, note: Note) -> ModelInfo:
     """Make a version the active one: an upgrade or a roll-back."""
-    row = await service.hub.write(twin.key, outcome.activate, twin.key, version, "requested")
+    former, row = await service.hub.write(twin.key, _activate, twin.key, version)
+    note(f"version {former or 'none'} -> {version}")
     service.live.model_changed(twin.key)
     return ModelInfo(**row.wire())
+
+
+def _activate(
+    connection: Connection, twin: int, version: int
+) -> tuple[tuple[int | None, models.ModelRow], Sequence[Stretch]]:
+    """Make a version the active one; return the former one's number, too."""
+    former = models.active_version(connection, twin)
+    row, stretches = outcome.activate(connection, twin, version, "requested")
+    return (former, row), stretches
 
 
 @router.delete("/{version}", status_code=204, dependencies=[operates])
@@ -68,7 +81,7 @@ async def delete(service: Running, twin: NamedTwin, version: Version) -> None:
 
 @router.post("", status_code=201, dependencies=[operates])
 async def add(
-    service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body(), AfterValidator(_storable)]
+    service: Running, twin: NamedTwin, body: Annotated[dict[str, Any], Body(), AfterValidator(_storable)], note: Note
 ) -> ModelInfo:
     """Store a model that the command line made for this twin as a new version, not active."""
     made = await service.live.inspect(body)
@@ -76,4 +89,5 @@ async def add(
     head = await service.database.read(models.first_us, twin.key)
     provenance = {"code_version": __version__, "settings": {}, "epoch_us": head, "data_sha256": None, "parent": None}
     row = await service.hub.write(twin.key, outcome.add_manual, twin.key, made, provenance)
+    note(f"version {row.version}")
     return ModelInfo(**row.wire())

@@ -241,8 +241,11 @@ async def discard(
     twin: NamedTwin,
     start: Annotated[str | None, Query(description="First instant, RFC 3339 or unix seconds.")] = None,
     stop: Annotated[str | None, Query(description="First instant after the last one that goes.")] = None,
+    everything: Annotated[bool, Query(alias="all", description="Instead of start and stop: all of it.")] = False,
 ) -> Deletion:
     """Delete samples in quarantine; it can be undone for a day."""
+    if everything == (start is not None or stop is not None):
+        raise Problem(422, "name start, stop or both; to delete everything in quarantine, all=true alone")
     made = await service.database.write_to(twin.key, aside.discard, twin.key, len(twin.channels), *span(start, stop))
     log.warning("samples in quarantine were deleted", extra={"twin": twin.name, **made.wire()})
     return Deletion(**made.wire())

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from service.errors import BadField
-from service.http.deps import NamedTwin, Running, Service, operates, reads
+from service.http.deps import NamedTwin, Note, Running, Service, operates, reads
 from service.http.specification_body import BODY, read_specification
 from service.instants import format_instant, now_us
 from service.live import forecasts
@@ -94,10 +94,12 @@ async def _telemetry(service: Service, twin: Entry, version: int | None) -> dict
 
 
 @router.post("", status_code=201, dependencies=[operates], openapi_extra=BODY)
-async def register(service: Running, response: Response, request: Request) -> TwinDetail:
+async def register(service: Running, response: Response, request: Request, note: Note) -> TwinDetail:
     """Register a specification, JSON or YAML (201); the identical one again answers 200, another one under its id 409."""
     given = await read_specification(request)
+    note(given.spec.twin)  # a refusal is to name it, too
     twin, is_new = await service.register(given.spec, given.data)
+    note(f"{twin.name}, revision {twin.revision}")
     response.status_code = 201 if is_new else 200
     response.headers["Location"] = f"/v1/twins/{twin.name}"
     return await _detail(service, twin)
@@ -126,7 +128,7 @@ async def inspect(service: Running, twin: NamedTwin) -> TwinDetail:
 
 
 @router.put("/{twin}", dependencies=[operates], openapi_extra=BODY)
-async def revise(service: Running, twin: NamedTwin, request: Request) -> RevisedTwin:
+async def revise(service: Running, twin: NamedTwin, request: Request, note: Note) -> RevisedTwin:
     """Give the twin another specification (a new sensor, load or limit); archive and models stay.
 
     The answer says which models still hold. A channel cannot be removed, nor change its kind or unit.
@@ -134,7 +136,8 @@ async def revise(service: Running, twin: NamedTwin, request: Request) -> Revised
     given = await read_specification(request)
     if given.spec.twin != twin.name:
         raise BadField("twin", f"is '{given.spec.twin}', the path names '{twin.name}'")
-    made, _ = await service.revise(twin, given.spec, given.data)
+    made, is_new = await service.revise(twin, given.spec, given.data)
+    note(f"{twin.name}, revision {made.revision}{'' if is_new else ' as before'}")
     detail = await _detail(service, made)
     standing = await service.database.read(_standing, made)
     return RevisedTwin(**detail.model_dump(), models=standing)
@@ -164,10 +167,11 @@ async def keeps(service: Running, twin: NamedTwin) -> Retention:
 
 
 @router.put("/{twin}/retention", dependencies=[operates])
-async def keep(service: Running, twin: NamedTwin, request: RetentionRequest) -> Retention:
+async def keep(service: Running, twin: NamedTwin, request: RetentionRequest, note: Note) -> Retention:
     """Settle how long what belongs to the twin is kept; what is older goes for ever, within minutes."""
     wanted = retention.Retention(**request.model_dump())
-    await service.database.write_to(twin.key, retention.put, twin.key, wanted)
+    former = await service.database.write_to(twin.key, retention.put, twin.key, wanted)
+    note(wanted.changes(former))
     service.housekeeping.wake()
     return Retention(**asdict(wanted))
 

@@ -40,13 +40,11 @@ def backup(source: Path, target: Path) -> Contents:
     if target.exists():
         raise StoreError(f"{target}: exists already; choose another name or remove it")
     part = target.with_name(target.name + ".part")
-    part.unlink(missing_ok=True)
     with _opened(source) as connection:
         _look(connection, source)
         try:
-            connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
-            connection.execute("VACUUM INTO ?", (str(part),))
-        except sqlite3.Error as error:
+            _write(connection, part)
+        except (OSError, sqlite3.Error) as error:
             part.unlink(missing_ok=True)
             raise StoreError(f"{target}: cannot be written ({error})") from error
     contents = check(part)
@@ -87,10 +85,8 @@ def restore(copy: Path, target: Path) -> tuple[Contents, Path | None]:
     lock = FileLock(target)
     try:
         part = target.with_name(target.name + ".part")
-        part.unlink(missing_ok=True)
         with _opened(copy) as connection:
-            connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
-            connection.execute("VACUUM INTO ?", (str(part),))
+            _write(connection, part)
         if check(part) != contents:
             raise StoreError(f"{copy}: could not be copied whole")
         former = None
@@ -144,6 +140,14 @@ def _opened(path: Path) -> Iterator[Connection]:
         raise StoreError(f"{path}: there is no such file")
     with contextlib.closing(sqlite3.connect(path, isolation_level=None, timeout=30.0)) as connection:
         yield connection
+
+
+def _write(connection: Connection, part: Path) -> None:
+    """Write a copy that only its owner may read: it holds the secrets of webhooks."""
+    part.unlink(missing_ok=True)
+    os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600))
+    connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
+    connection.execute("VACUUM INTO ?", (str(part),))  # an empty file may stand there
 
 
 def _look(connection: Connection, path: Path) -> Contents:

@@ -91,6 +91,7 @@ class SqliteEngine:
         self._lock = FileLock(path, name)
         self._local = threading.local()
         self._opened: list[sqlite3.Connection] = []
+        _tell_if_open(path)
         try:
             self._writer = _open(path)
         except sqlite3.Error as error:
@@ -142,6 +143,14 @@ class SqliteEngine:
         for connection in self._opened:
             connection.close()
         self._lock.release()
+
+
+def _tell_if_open(path: Path) -> None:
+    """Warn of a file that others may read; it stays as it is, since somebody may have meant it."""
+    mode = path.stat().st_mode & 0o777
+    if mode & 0o044:
+        told = "others may read the database, which holds the secrets of webhooks; chmod 600 ends that"
+        log.warning(told, extra={"file": str(path), "mode": f"{mode:04o}"})
 
 
 def _open(path: Path) -> sqlite3.Connection:

@@ -32,7 +32,7 @@ class FileLock:
         found = place.stat() if place.exists() else None
         if found is not None and (found.st_dev, found.st_ino) in _held:
             raise self._taken()
-        file = self._lock(place, 0o644)
+        file = self._lock(place, 0o600)  # SQLite makes its journals as the file is
         status = os.fstat(file)
         self._identity = (status.st_dev, status.st_ino)
         _held.add(self._identity)
