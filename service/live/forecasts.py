@@ -12,7 +12,7 @@ from service.instants import format_instant, format_instants, in_words, now_us, 
 from service.live.engine import Engine
 from service.live.known import Known
 from service.live.position import Position
-from service.live.pulse import Beat
+from service.live.pulse import Beat, listed
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
 from service.store.anomalies import WORDS
@@ -225,6 +225,28 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
             else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
+
+
+def unheard(look: Look, beats: Mapping[str, Beat]) -> list[str]:
+    """Say of which inputs nothing had come for long where a forecast begins; those that are planned or computed do not count.
+
+    By the time that samples bear, so of a recording as well: what counts is what its state and its future were told by.
+    """
+    found = {}
+    for name, how in look.made.inputs.items():
+        beat = beats.get(name)
+        if how not in ("repeat", "hold") or beat is None or beat.last_us is None or beat.interval_s is None:
+            continue  # what was sent once is a setting, and holds
+        silent_s = (look.position.time_us - beat.last_us) / 1e6
+        if silent_s > beat.stale_after_s:
+            found[name] = silent_s
+    if not found:
+        return []
+    them, most = ("them", "up to ") if len(found) > 1 else ("it", "")
+    for_how_long = f"{most}{in_words(max(found.values()))}"
+    return [
+        f"no telemetry of {listed(list(found))} for {for_how_long}: what is assumed of {them} rests on what came before"
+    ]
 
 
 def doubts(twin: Entry, open_kinds: Mapping[str, Sequence[str]]) -> list[str]:

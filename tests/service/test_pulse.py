@@ -98,6 +98,29 @@ def test_a_forecast_says_that_telemetry_stopped(make_client, clock: list[float])
     assert any("no telemetry has arrived for 2 h 47 min" in notice for notice in late["notices"])
 
 
+def test_a_forecast_says_of_which_inputs_nothing_comes_any_more(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    begin = clock[0] - 100.0
+    send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    ahead = {"horizon_s": 60.0, "step_s": 60.0}
+    told = []
+    for silent_s in (30.0, 10_800.0):
+        clock[0] = begin + 99.0 + silent_s
+        send(client, [clock[0] - k for k in range(20)], T_px=[290.0] * 20, T_tank=[15.0] * 20)
+        told.append(client.get(f"{TWIN}/forecast", params=ahead).json()["notices"])
+    line = "no telemetry of Q_px for 3 h: what is assumed of it rests on what came before"
+    assert told == [["held the last readings"], ["held the last readings", line]]
+    assert channels(client)["Q_px"]["state"] == "stale"
+    plan = {"time": [clock[0]], "values": {"Q_px": [1.0]}}
+    assert line not in client.post(f"{TWIN}/forecasts", json={**ahead, "plan": plan}).json()["notices"]
+    client.request("DELETE", f"{TWIN}/telemetry", params={"start": begin + 1.0, "channels": "Q_px"})
+    setting = client.get(f"{TWIN}/forecast", params=ahead).json()  # it was sent once: nobody expects it again
+    assert setting["notices"][1:] == []
+
+
 def test_readings_that_repeat_are_a_sign(make_client) -> None:
     client = make(make_client)
     wobble = [290.0 + 0.25 * (k * 7 % 5) for k in range(200)]

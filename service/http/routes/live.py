@@ -55,6 +55,7 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     expected = list(limits.expected(twin, look.position.time_us, look.made))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    document["notices"] += forecasts.unheard(look, beats)
     document["notices"] += forecasts.doubts(twin, kinds)
     if missing := lacks(look.active.specification, twin.specification):
         what = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
