@@ -227,6 +227,20 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
     return told
 
 
+def delays(twin: Entry, position: Position, beats: Mapping[str, Beat]) -> list[str]:
+    """Say that telemetry arrives, but so long after the fact that a sensor which is as late would be taken for silent."""
+    at_us = now_us()
+    heard = [name for name in twin.sensors if beats[name].standing(at_us) in ("live", "delayed")]
+    late = {name: s for name in heard if (s := beats[name].delay_s or 0.0) > beats[name].stale_after_s}
+    if not late:
+        return []
+    if len(late) < len(heard):
+        most = "up to " if len(late) > 1 else ""
+        return [f"telemetry of {listed(list(late))} arrives {most}{in_words(max(late.values()))} late"]
+    starts = f"this forecast starts at {format_instant(position.time_us)}"
+    return [f"telemetry arrives {in_words(min(late.values()))} late: {starts}"]
+
+
 def unheard(look: Look, beats: Mapping[str, Beat]) -> list[str]:
     """Say of which inputs nothing had come for long where a forecast begins; those that are planned or computed do not count.
 

@@ -98,6 +98,45 @@ def test_a_forecast_says_that_telemetry_stopped(make_client, clock: list[float])
     assert any("no telemetry has arrived for 2 h 47 min" in notice for notice in late["notices"])
 
 
+def test_a_forecast_says_that_telemetry_arrives_late(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    told = []
+    for late_s in (269 * 86_400.0, 300.0, 61.0, 59.0, 0.0):
+        begin = clock[0] - late_s - 99.0
+        send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+        if not told:
+            path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+            while client.get(path).json()["state"] in ("queued", "running"):
+                time.sleep(0.02)
+        found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+        assert found["behind_s"] == 0.0
+        told.append([notice for notice in found["notices"][1:] if "frozen" not in notice])
+        clock[0] += 1000.0
+    assert told == [
+        ["telemetry arrives 269 d late: this forecast starts at 2026-04-21T08:00:00Z"],
+        ["telemetry arrives 5 min late: this forecast starts at 2027-01-15T08:11:40Z"],
+        ["telemetry arrives 1 min 1 s late: this forecast starts at 2027-01-15T08:32:19Z"],
+        [],
+        [],
+    ]
+    send(client, [clock[0] - 1.0, clock[0]], T_px=[290.0] * 2, T_tank=[15.0] * 2)
+    send(client, [clock[0] - 7200.0], T_px=[290.0], T_tank=[15.0])  # what was missing is handed in later
+    assert states(client)["T_px"] == "live"
+    assert all("arrives" not in text for text in client.get(f"{TWIN}/forecast?horizon_s=60").json()["notices"])
+
+
+def test_a_forecast_names_the_sensors_that_arrive_late_while_others_do_not(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    begin = clock[0] - 7300.0
+    send(client, [begin + k for k in range(100)], T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+    send(client, [clock[0] - k for k in range(100)], T_px=[290.0] * 100, Q_px=[0.5] * 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    notices = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()["notices"]
+    assert "telemetry of T_tank arrives 2 h late" in notices and states(client)["T_tank"] == "delayed"
+
+
 def test_a_forecast_says_of_which_inputs_nothing_comes_any_more(make_client, clock: list[float]) -> None:
     client = make(make_client)
     begin = clock[0] - 100.0
