@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.errors import BadField, NotYet, Refusal, short
-from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
+from service.instants import AGREEING_US, format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
 from service.live.known import Known
 from service.live.position import Position
@@ -225,6 +225,20 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
             else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
+
+
+def ahead_of_clock(twin: Entry, position: Position) -> list[str]:
+    """Say that a forecast begins in the future, by a clock that quarantine still believes.
+
+    A spacecraft's clock may differ a little, and a sample may be stamped with the end of what it measures: neither is told.
+    """
+    ahead_us = position.time_us - now_us()
+    if ahead_us <= position.sampling_s * 1e6 + AGREEING_US:
+        return []
+    return [
+        f"this forecast starts at {format_instant(position.time_us)}, {in_words(ahead_us / 1e6)} ahead of this service's clock: "
+        f"the clock of the newest samples may be wrong; if so, DELETE /v1/twins/{twin.name}/telemetry takes them away"
+    ]
 
 
 def delays(twin: Entry, position: Position, beats: Mapping[str, Beat]) -> list[str]:

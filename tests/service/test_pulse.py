@@ -125,6 +125,38 @@ def test_a_forecast_says_that_telemetry_arrives_late(make_client, clock: list[fl
     assert all("arrives" not in text for text in client.get(f"{TWIN}/forecast?horizon_s=60").json()["notices"])
 
 
+def test_a_forecast_says_that_it_begins_ahead_of_the_clock(make_client, clock: list[float]) -> None:
+    """Three frames of a clock that is 250 s fast, within the tolerance, move the present; live telemetry with jitter does not."""
+    client = make(make_client)
+
+    def frames(first: float, count: int, T_px: float = 290.0) -> None:
+        times = [first + k for k in range(count)]
+        send(client, times, T_px=[T_px] * count, T_tank=[15.0] * count, Q_px=[0.5] * count)
+
+    def told() -> list[str]:
+        found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+        return [notice for notice in found["notices"] if "clock" in notice]
+
+    begin = clock[0]
+    frames(begin - 99.0, 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    clock[0] = begin - 1.5
+    assert told() == []
+    clock[0] = begin
+    frames(begin + 250.0, 3, 250.0)
+    clock[0] = begin + 10.0
+    frames(begin + 1.0, 10)
+    (notice,) = told()
+    assert notice == (
+        "this forecast starts at 2027-01-15T08:04:12Z, 4 min 2 s ahead of this service's clock: the clock of the newest samples "
+        "may be wrong; if so, DELETE /v1/twins/benchsat/telemetry takes them away"
+    )
+    client.request("DELETE", f"{TWIN}/telemetry", params={"start": begin + 200.0})
+    assert told() == []
+
+
 def test_a_forecast_names_the_sensors_that_arrive_late_while_others_do_not(make_client, clock: list[float]) -> None:
     client = make(make_client)
     begin = clock[0] - 7300.0

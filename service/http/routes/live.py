@@ -56,6 +56,7 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     expected = list(limits.expected(twin, look.position.time_us, look.made, {row.limit for row in rows}))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    document["notices"] += forecasts.ahead_of_clock(twin, look.position)
     document["notices"] += forecasts.delays(twin, look.position, beats)
     document["notices"] += forecasts.unheard(look, beats)
     document["notices"] += forecasts.doubts(twin, kinds)
