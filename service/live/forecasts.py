@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from service.errors import BadField, NotYet, Refusal, short
-from service.instants import format_instant, format_instants, in_words, now_us, parse_instants
+from service.instants import AGREEING_US, format_instant, format_instants, in_words, now_us, parse_instants
 from service.live.engine import Engine
 from service.live.known import Known
 from service.live.position import Position
-from service.live.pulse import Beat
+from service.live.pulse import Beat, listed
 from service.schemas import Columns, ForecastRequest
 from service.store import samples, twins
 from service.store.anomalies import WORDS
@@ -225,6 +225,56 @@ def notices(tracker: Known, position: Position, lag: Behind, silent_s: float | N
             else f"{lag.quarantined} samples ahead of the receive clock are in quarantine and not used: their clock may be wrong"
         )
     return told
+
+
+def ahead_of_clock(twin: Entry, position: Position) -> list[str]:
+    """Say that a forecast begins in the future, by a clock that quarantine still believes.
+
+    A spacecraft's clock may differ a little, and a sample may be stamped with the end of what it measures: neither is told.
+    """
+    ahead_us = position.time_us - now_us()
+    if ahead_us <= position.sampling_s * 1e6 + AGREEING_US:
+        return []
+    return [
+        f"this forecast starts at {format_instant(position.time_us)}, {in_words(ahead_us / 1e6)} ahead of this service's clock: "
+        f"the clock of the newest samples may be wrong; if so, DELETE /v1/twins/{twin.name}/telemetry takes them away"
+    ]
+
+
+def delays(twin: Entry, position: Position, beats: Mapping[str, Beat]) -> list[str]:
+    """Say that telemetry arrives, but so long after the fact that a sensor which is as late would be taken for silent."""
+    at_us = now_us()
+    heard = [name for name in twin.sensors if beats[name].standing(at_us) in ("live", "delayed")]
+    late = {name: s for name in heard if (s := beats[name].delay_s or 0.0) > beats[name].stale_after_s}
+    if not late:
+        return []
+    if len(late) < len(heard):
+        most = "up to " if len(late) > 1 else ""
+        return [f"telemetry of {listed(list(late))} arrives {most}{in_words(max(late.values()))} late"]
+    starts = f"this forecast starts at {format_instant(position.time_us)}"
+    return [f"telemetry arrives {in_words(min(late.values()))} late: {starts}"]
+
+
+def unheard(look: Look, beats: Mapping[str, Beat]) -> list[str]:
+    """Say of which inputs nothing had come for long where a forecast begins; those that are planned or computed do not count.
+
+    By the time that samples bear, so of a recording as well: what counts is what its state and its future were told by.
+    """
+    found = {}
+    for name, how in look.made.inputs.items():
+        beat = beats.get(name)
+        if how not in ("repeat", "hold") or beat is None or beat.last_us is None or beat.interval_s is None:
+            continue  # what was sent once is a setting, and holds
+        silent_s = (look.position.time_us - beat.last_us) / 1e6
+        if silent_s > beat.stale_after_s:
+            found[name] = silent_s
+    if not found:
+        return []
+    them, most = ("them", "up to ") if len(found) > 1 else ("it", "")
+    for_how_long = f"{most}{in_words(max(found.values()))}"
+    return [
+        f"no telemetry of {listed(list(found))} for {for_how_long}: what is assumed of {them} rests on what came before"
+    ]
 
 
 def doubts(twin: Entry, open_kinds: Mapping[str, Sequence[str]]) -> list[str]:

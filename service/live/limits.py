@@ -2,7 +2,8 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -191,13 +192,22 @@ def reached(limit: Limit, from_us: int, made: Forecasted) -> tuple[Ahead, bool]:
     return ahead, may
 
 
-def expected(twin: Entry, from_us: int, made: Forecasted) -> Iterator[Json]:
-    """Yield what a forecast says of each limit that it may reach, in one future of twenty at least."""
+def expected(twin: Entry, from_us: int, made: Forecasted, lasting: Collection[Limit]) -> Iterator[Json]:
+    """Yield what a forecast says of each limit that it may reach, in one future of twenty at least.
+
+    A limit that is behind already, by the state or by an alarm of those that last, is said to be.
+    """
+    whole = made.since(from_us)
     for limit in limits_of(twin, FORECAST):
-        ahead, _ = reached(limit, from_us, made)
+        ahead, _ = reached(limit, from_us, whole)
+        is_there = replace(limit, origin=MEASURED) in lasting or ahead.expected_s == 0.0
+        if is_there:
+            ahead = Ahead(0.0, 0.0, 0.0)
         if ahead.earliest_s is not None:
+            unit = twin.units[limit.channel]
             place = {"channel": limit.channel, "colour": limit.colour, "side": limit.side, "limit": limit.bound}
-            yield place | describe(limit, twin.units[limit.channel], from_us, ahead)
+            says = {"message": f"{_is_beyond(limit, unit)} already"} if is_there else {}
+            yield place | describe(limit, unit, from_us, ahead) | says
 
 
 def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json:
@@ -224,8 +234,11 @@ def _band(twin: Entry, limit: Limit) -> float:
 
 
 def _says(limit: Limit, unit: str | None, worst: float) -> str:
-    where = "above" if limit.side == "high" else "below"
-    return f"{limit.channel} is {where} {_bound(limit, unit)}: {worst:.4g} at worst"
+    return f"{_is_beyond(limit, unit)}: {worst:.4g} at worst"
+
+
+def _is_beyond(limit: Limit, unit: str | None) -> str:
+    return f"{limit.channel} is {'above' if limit.side == 'high' else 'below'} {_bound(limit, unit)}"
 
 
 def _bound(limit: Limit, unit: str | None) -> str:

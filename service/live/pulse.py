@@ -113,6 +113,11 @@ class Pulse:
             yield Beat(known[-1] if known else None, received_us or None, interval_s)
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return channels as one says them, five by name at most."""
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
 def overall(sensors: Sequence[Beat], at_us: int) -> tuple[Overall, float | None]:
     """Return how the sensors of a twin stand, all of them together, and for how long nothing has arrived, in seconds."""
     silent_s = min((s for beat in sensors if (s := beat.silent_s(at_us)) is not None), default=None)

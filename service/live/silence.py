@@ -1,16 +1,16 @@
-"""Sensors that fall silent, and speak again, are told once: to the stream, and by it to webhooks."""
+"""Channels that fall silent, and speak again, are told once: to the stream, and by it to webhooks."""
 
 import asyncio
 import contextlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from service.errors import Refusal
 from service.fleet.ownership import Alone, Ownership
 from service.instants import in_words, now_us
 from service.jobs import outcome
 from service.live.live import Live
-from service.live.pulse import Beat
+from service.live.pulse import Beat, listed
 from service.store.errors import LeaseLost, TwinGone
 from service.stream.hub import Hub
 from service.twins.registry import Entry, Registry
@@ -44,7 +44,7 @@ class Silence:
             try:
                 beats = await self._live.beats_of(owned)
             except Refusal as error:
-                log.info("nobody can tell which sensors are silent", extra={"reason": error.detail})
+                log.info("nobody can tell which channels are silent", extra={"reason": error.detail})
                 continue
             for twin in owned:
                 if twin.key not in beats:
@@ -54,26 +54,26 @@ class Silence:
                 except (TwinGone, LeaseLost):
                     self._silent.pop(twin.key, None)
                 except Exception:
-                    log.exception("nobody can tell which sensors are silent", extra={"twin": twin.name})
+                    log.exception("nobody can tell which channels are silent", extra={"twin": twin.name})
 
     async def look(self, twin: Entry, beats: Mapping[str, Beat] | None = None) -> None:
-        """Tell which sensors of a twin fell silent since the last look, and which ones are heard again."""
+        """Tell which channels of a twin fell silent since the last look, and which ones are heard again."""
         beats = beats or await self._live.beats(twin)
         at_us = now_us()
-        silent = frozenset(name for name in twin.sensors if beats[name].standing(at_us) == "stale")
+        silent = frozenset(
+            name
+            for name, beat in beats.items()
+            if beat.standing(at_us) == "stale" and (name in twin.sensors or beat.interval_s is not None)
+        )  # an input that was sent once is a setting: nobody expects it again
         before = self._silent.get(twin.key, frozenset())
         self._silent[twin.key] = silent
         messages = []
         if fallen := sorted(silent - before):
             ages = [age for name in fallen if (age := beats[name].silent_s(at_us)) is not None]
             since = f" for {in_words(max(ages))}" if ages else ""
-            text = f"no telemetry of {_listed(fallen)}{since}"
+            text = f"no telemetry of {listed(fallen)}{since}"
             messages.append(("stale", {"state": "stale", "channels": fallen, "text": text}))
         if back := sorted(before - silent):
-            messages.append(("stale", {"state": "live", "channels": back, "text": f"{_listed(back)} reports again"}))
+            messages.append(("stale", {"state": "live", "channels": back, "text": f"{listed(back)} reports again"}))
         if messages:
             await self._hub.write(twin.key, self._ownership.guard(twin.key)(outcome.tell), twin.key, messages)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -183,7 +183,8 @@ class CoreWorkbench:
         quantiles = {q: columns(values) for q, values in ahead.quantiles_K.items()}
         low, high = (columns(end) for end in ahead.whole_K)
         whole = {name: (low[name], high[name]) for name in ahead.sensors}
-        return Forecasted(time_us, columns(ahead.mean_K), quantiles, ahead.notices, whole, WHOLE, ahead.inputs)
+        present = {name: float(column[0]) for name, column in columns(ahead.present_K[None, :]).items()}
+        return Forecasted(time_us, columns(ahead.mean_K), quantiles, present, ahead.notices, whole, WHOLE, ahead.inputs)
 
     def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
         """Return temperatures and heat flows of the moment that the state describes."""

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -166,6 +166,7 @@ class ForecastTask:
 class Forecasted:
     """Future readings in the channels' own units: (n_times,) and per sensor (n_times,).
 
+    ``present`` is what each sensor reads by the state from which the forecast starts.
     ``whole`` is the low and the high end of the simultaneous band, in which a sensor's whole path stays with
     ``whole_probability``; ``inputs`` says where the future of each driving channel comes from.
     """
@@ -173,10 +174,20 @@ class Forecasted:
     time_us: NDArray[np.int64]
     mean: dict[str, NDArray[np.float64]]
     quantiles: dict[float, dict[str, NDArray[np.float64]]]
+    present: Mapping[str, float]
     notices: tuple[str, ...] = ()
     whole: dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=dict)
     whole_probability: float = 0.9
     inputs: Mapping[str, str] = field(default_factory=dict)
+
+    def since(self, from_us: int) -> "Forecasted":
+        """Return times and quantiles with the present before them, which is known."""
+        time_us = np.concatenate([[from_us], self.time_us])
+        quantiles = {
+            q: {name: np.concatenate([[self.present[name]], column]) for name, column in columns.items()}
+            for q, columns in self.quantiles.items()
+        }
+        return replace(self, time_us=time_us, quantiles=quantiles)
 
 
 class Workbench(Protocol):

@@ -128,7 +128,9 @@ class FakeWorkbench:
         planned = 0.0 if task.plan is None else task.plan.values["Q_px"][-1]
         mean = {s: np.full(count, last + planned) for s, last in zip(SENSORS, task.state["last"], strict=True)}
         quantiles = {q: {s: m + q - 0.5 for s, m in mean.items()} for q in task.quantiles}
-        return Forecasted(time_us, mean, quantiles, ("held the last readings",))
+        inputs = {"Q_px": "hold" if task.plan is None else "plan"}
+        present = dict(zip(SENSORS, task.state["last"], strict=True))
+        return Forecasted(time_us, mean, quantiles, present, ("held the last readings",), inputs=inputs)
 
     def flows(self, document: str, telemetry: Telemetry, state: Json) -> Json:
         nodes = [{"id": "px", "temperature_K": state["last"][0], "heat_W": 0.0, "sensed": True}]

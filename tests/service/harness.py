@@ -19,6 +19,11 @@ def until(found: Callable[[], Any], patience_s: float = 60.0) -> Any:
     return answer
 
 
+def notices(forecast: dict[str, Any]) -> list[str]:
+    """Return what a forecast tells besides that its telemetry is of long ago, as it is in most tests."""
+    return [text for text in forecast["notices"] if not text.startswith("telemetry arrives ")]
+
+
 class AppClient:
     """Starts an application and speaks to it without a socket."""
 

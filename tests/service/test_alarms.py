@@ -165,6 +165,27 @@ def test_a_forecast_says_when_a_limit_is_reached(client: AppClient) -> None:
     assert near[0]["expected"] is None
 
 
+def test_a_forecast_counts_from_the_present_and_not_from_its_first_step(client: AppClient) -> None:
+    """At 306 K, 310 K are reached after 400 s of a first step of 600 s; 300 K are behind."""
+    send(client, [float(k) for k in range(100)], [306.0] * 100)
+    calibrate(client)
+    alarms(client, 1, on="measured")
+    found = client.get(f"{TWIN}/forecast", params={"horizon_s": 3600, "step_s": 600}).json()
+    yellow, red = found["limits"]
+    assert yellow["message"] == "T_px is above its yellow limit of 300 K already"
+    assert [yellow[name] for name in ("earliest", "expected", "latest")] == [found["from"]] * 3
+    assert red["message"] == "T_px reaches its red limit of 310 K in 6 min 40 s (90 %: 4 min to 13 min 20 s)"
+    assert red["expected"] == "1970-01-01T00:08:19Z"
+
+
+def test_a_forecast_does_not_contradict_an_alarm_that_lasts(client: AppClient) -> None:
+    send(client, [float(k) for k in range(101)], [301.0] * 100 + [299.9])  # within the dead band of 0.3 K
+    calibrate(client)
+    alarms(client, 1, on="measured", stop=None)
+    (yellow, *_) = client.get(f"{TWIN}/forecast", params={"horizon_s": 3600, "step_s": 600}).json()["limits"]
+    assert yellow["message"] == "T_px is above its yellow limit of 300 K already"
+
+
 def test_a_forecast_alarm_gives_way_to_the_measured_one(client: AppClient, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("service.live.limits.FORECAST_EVERY_S", 0.1)
     send(client, [float(k) for k in range(100)], [290.0] * 100)

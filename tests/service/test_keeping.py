@@ -300,6 +300,27 @@ def test_silence_is_told_once_and_ends(registered: AppClient, sql: Sql) -> None:
     assert rows[0]["text"].startswith("no telemetry of T_px for")
 
 
+def test_inputs_that_fall_silent_are_told_as_well_but_no_setting_that_was_sent_once(
+    registered: AppClient, sql: Sql
+) -> None:
+    service = registered.app.state.service
+
+    async def look() -> None:
+        silence = Silence(service.registry, service.live, service.hub)
+        await silence.close()
+        await silence.look(service.registry.get("benchsat"))
+
+    now = time.time()
+    for times in ([now - 200.0], [now - 198.0, now - 199.0]):
+        registered.post(f"{TWIN}/telemetry", json={"time": times, "values": {"Q_px": [0.5] * len(times)}})
+        service.live._pulses.clear()
+        sql("UPDATE chunk SET received = time")
+        registered.portal.call(look)
+        rows = [json.loads(body) for (body,) in sql("SELECT body FROM event WHERE type = 'stale' ORDER BY seq")]
+        assert [row["channels"] for row in rows] == ([] if len(times) == 1 else [["Q_px"]])
+    assert rows[0]["text"].startswith("no telemetry of Q_px for 3 min")
+
+
 @pytest.mark.e2e
 def test_a_backup_is_taken_while_serving_and_can_be_restored(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]

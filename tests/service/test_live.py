@@ -17,7 +17,7 @@ from service.stream import past
 from service.workbench.interface import Filtered, Json, Telemetry
 from tests.service.conftest import SPEC, Sql
 from tests.service.fakes import DEADLY, UNFIT, FakeWorkbench
-from tests.service.harness import AppClient, until
+from tests.service.harness import AppClient, notices, until
 
 TWIN = "/v1/twins/benchsat"
 
@@ -197,7 +197,7 @@ def test_forecast_from_the_state(client: AppClient) -> None:
     assert found["time"] == [f"1970-01-01T00:0{m}:{s}Z" for m, s in ((2, "00"), (2, "20"), (2, "40"))]
     assert found["values"]["T_px"] == {"mean": [7, 7, 7], "q05": [6.55] * 3, "q50": [7] * 3, "q95": [7.45] * 3}
     assert (found["model_version"], found["from"]) == (1, "1970-01-01T00:01:40Z")
-    assert found["units"] == {"T_px": "K", "T_tank": "degC"} and found["notices"] == ["held the last readings"]
+    assert found["units"] == {"T_px": "K", "T_tank": "degC"} and notices(found) == ["held the last readings"]
     plan = {"time": [110, "1970-01-01T00:02:00Z"], "values": {"Q_px": [1.0, 5.0]}}
     body = {"horizon_s": 60, "step_s": 60, "plan": plan, "quantiles": [0.975]}
     planned = client.post(f"{TWIN}/forecasts", json=body).json()
@@ -301,7 +301,7 @@ def test_once_others_follow_a_lone_sample_takes_part(client: AppClient) -> None:
     send(client, [3601], [291.0])
     assert list(residuals(client).values())[-2:] == [290.0 - SCALE_K * 99**2, 1.0]
     found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
-    assert found["from"] == "1970-01-01T01:00:01Z" and found["notices"] == ["held the last readings"]
+    assert found["from"] == "1970-01-01T01:00:01Z" and notices(found) == ["held the last readings"]
     sent = [m for m in messages(client) if m["type"] == "residual"]
     assert [m["time"] for m in sent] == ["1970-01-01T01:00:00Z", "1970-01-01T01:00:01Z"]
 

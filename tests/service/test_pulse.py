@@ -98,6 +98,100 @@ def test_a_forecast_says_that_telemetry_stopped(make_client, clock: list[float])
     assert any("no telemetry has arrived for 2 h 47 min" in notice for notice in late["notices"])
 
 
+def test_a_forecast_says_that_telemetry_arrives_late(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    told = []
+    for late_s in (269 * 86_400.0, 300.0, 61.0, 59.0, 0.0):
+        begin = clock[0] - late_s - 99.0
+        send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+        if not told:
+            path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+            while client.get(path).json()["state"] in ("queued", "running"):
+                time.sleep(0.02)
+        found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+        assert found["behind_s"] == 0.0
+        told.append([notice for notice in found["notices"][1:] if "frozen" not in notice])
+        clock[0] += 1000.0
+    assert told == [
+        ["telemetry arrives 269 d late: this forecast starts at 2026-04-21T08:00:00Z"],
+        ["telemetry arrives 5 min late: this forecast starts at 2027-01-15T08:11:40Z"],
+        ["telemetry arrives 1 min 1 s late: this forecast starts at 2027-01-15T08:32:19Z"],
+        [],
+        [],
+    ]
+    send(client, [clock[0] - 1.0, clock[0]], T_px=[290.0] * 2, T_tank=[15.0] * 2)
+    send(client, [clock[0] - 7200.0], T_px=[290.0], T_tank=[15.0])  # what was missing is handed in later
+    assert states(client)["T_px"] == "live"
+    assert all("arrives" not in text for text in client.get(f"{TWIN}/forecast?horizon_s=60").json()["notices"])
+
+
+def test_a_forecast_says_that_it_begins_ahead_of_the_clock(make_client, clock: list[float]) -> None:
+    """Three frames of a clock that is 250 s fast, within the tolerance, move the present; live telemetry with jitter does not."""
+    client = make(make_client)
+
+    def frames(first: float, count: int, T_px: float = 290.0) -> None:
+        times = [first + k for k in range(count)]
+        send(client, times, T_px=[T_px] * count, T_tank=[15.0] * count, Q_px=[0.5] * count)
+
+    def told() -> list[str]:
+        found = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
+        return [notice for notice in found["notices"] if "clock" in notice]
+
+    begin = clock[0]
+    frames(begin - 99.0, 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    clock[0] = begin - 1.5
+    assert told() == []
+    clock[0] = begin
+    frames(begin + 250.0, 3, 250.0)
+    clock[0] = begin + 10.0
+    frames(begin + 1.0, 10)
+    (notice,) = told()
+    assert notice == (
+        "this forecast starts at 2027-01-15T08:04:12Z, 4 min 2 s ahead of this service's clock: the clock of the newest samples "
+        "may be wrong; if so, DELETE /v1/twins/benchsat/telemetry takes them away"
+    )
+    client.request("DELETE", f"{TWIN}/telemetry", params={"start": begin + 200.0})
+    assert told() == []
+
+
+def test_a_forecast_names_the_sensors_that_arrive_late_while_others_do_not(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    begin = clock[0] - 7300.0
+    send(client, [begin + k for k in range(100)], T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+    send(client, [clock[0] - k for k in range(100)], T_px=[290.0] * 100, Q_px=[0.5] * 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    notices = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()["notices"]
+    assert "telemetry of T_tank arrives 2 h late" in notices and states(client)["T_tank"] == "delayed"
+
+
+def test_a_forecast_says_of_which_inputs_nothing_comes_any_more(make_client, clock: list[float]) -> None:
+    client = make(make_client)
+    begin = clock[0] - 100.0
+    send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+    ahead = {"horizon_s": 60.0, "step_s": 60.0}
+    told = []
+    for silent_s in (30.0, 10_800.0):
+        clock[0] = begin + 99.0 + silent_s
+        send(client, [clock[0] - k for k in range(20)], T_px=[290.0] * 20, T_tank=[15.0] * 20)
+        told.append(client.get(f"{TWIN}/forecast", params=ahead).json()["notices"])
+    line = "no telemetry of Q_px for 3 h: what is assumed of it rests on what came before"
+    assert told == [["held the last readings"], ["held the last readings", line]]
+    assert channels(client)["Q_px"]["state"] == "stale"
+    plan = {"time": [clock[0]], "values": {"Q_px": [1.0]}}
+    assert line not in client.post(f"{TWIN}/forecasts", json={**ahead, "plan": plan}).json()["notices"]
+    client.request("DELETE", f"{TWIN}/telemetry", params={"start": begin + 1.0, "channels": "Q_px"})
+    setting = client.get(f"{TWIN}/forecast", params=ahead).json()  # it was sent once: nobody expects it again
+    assert setting["notices"][1:] == []
+
+
 def test_readings_that_repeat_are_a_sign(make_client) -> None:
     client = make(make_client)
     wobble = [290.0 + 0.25 * (k * 7 % 5) for k in range(200)]

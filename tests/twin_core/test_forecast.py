@@ -45,7 +45,7 @@ def test_inputs_without_a_plan_hold_their_last_value() -> None:
     found = forecast(integrator(), now(10.0), 1000.0, step_s=100.0, state=known_start())
     np.testing.assert_allclose(found.time_s, NOW_S + 100.0 * np.arange(1, 11))
     np.testing.assert_allclose(found.mean_K[:, 0], 290.0 + 10.0 * 100.0 * np.arange(1, 11) / CAPACITY_J_PER_K)
-    assert found.sensors == ("T0",)
+    assert (found.sensors, found.present_K.tolist()) == (("T0",), [290.0])
 
 
 def test_a_plan_is_honoured_between_the_forecasts_own_times() -> None:

@@ -40,6 +40,8 @@ class Forecast:
         Probability -> (n_times, n_sensors): of what the sensors will read, their noise included.
     whole_K
         Low and high, (n_times, n_sensors) each: a sensor's readings all stay between them with probability ``WHOLE``.
+    present_K : (n_sensors,)
+        What the sensors read by the state from which the forecast starts.
     inputs
         Driving channel -> where its future comes from.
     notices
@@ -51,6 +53,7 @@ class Forecast:
     mean_K: FloatArray
     quantiles_K: dict[float, FloatArray]
     whole_K: tuple[FloatArray, FloatArray]
+    present_K: FloatArray
     inputs: Mapping[str, How] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
 
@@ -118,7 +121,8 @@ def forecast(
         raise ModelError("the heat balance has no solution over the horizon: check the planned inputs")
     wanted = np.flatnonzero(np.isin(future.time_s, own_times_s(record, horizon_s, step)[1:]))
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
-    here = (read + reading_offsets_K(network, values, future.clock_s))[wanted]
+    read = read + reading_offsets_K(network, values, future.clock_s)
+    here = read[wanted]
     beyond = extrapolations(network, model.effects, forcing, path)
     sampling_s = next((_sampling_s(r) for r in (record, before) if r.time_s.size > 1), step)
     outside = [b for _, b in beyond]
@@ -133,9 +137,8 @@ def forecast(
     short = () if found is None else _short(found, horizon_s)
     notices = (*orbit_notices(model.spec, [future]), *assumed.in_words(), *short, *in_words(beyond))
     made = {q: here + bands[q] for q in quantiles}
-    return Forecast(
-        future.time_s[wanted], model.spec.sensors, mean, made, (here + low, here + high), assumed.how, notices
-    )
+    whole = here + low, here + high
+    return Forecast(future.time_s[wanted], model.spec.sensors, mean, made, whole, read[0], assumed.how, notices)
 
 
 _BAND = (round(0.5 - 0.5 * WHOLE, 9), 0.5, round(0.5 + 0.5 * WHOLE, 9))

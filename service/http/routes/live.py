@@ -14,7 +14,7 @@ from service.http.routes.telemetry import Points, bounded, span
 from service.instants import format_instant, format_instants
 from service.live import forecasts, limits, screening
 from service.schemas import Anomaly, AnomalyList, Forecast, ForecastRequest, Inputs, Network, Residuals
-from service.store import anomalies, models, residuals, samples
+from service.store import alarms, anomalies, models, residuals, samples
 from service.store.residuals import Residuals as Found
 from service.twins.fit import lacks
 from service.twins.registry import Entry
@@ -50,11 +50,15 @@ async def _forecast(service: Service, twin: Entry, request: ForecastRequest) -> 
     ahead = forecasts.look_ahead(tracker, service.database, service.live.engine, request)
     version = None if tracker.active is None else tracker.active.version
     lasting = service.database.read(anomalies.open_kinds, twin.key, version)
-    look, beats, kinds = await asyncio.gather(ahead, service.live.beats(twin), lasting)
+    alarmed = service.database.read(alarms.lasting, twin.key)
+    look, beats, kinds, rows = await asyncio.gather(ahead, service.live.beats(twin), lasting, alarmed)
     silent_s = forecasts.silence_s(twin, beats)
-    expected = list(limits.expected(twin, look.position.time_us, look.made))
+    expected = list(limits.expected(twin, look.position.time_us, look.made, {row.limit for row in rows}))
     document = forecasts.render(twin, look, request.quantiles, expected)
     document["notices"] += forecasts.notices(tracker, look.position, look.lag, silent_s)
+    document["notices"] += forecasts.ahead_of_clock(twin, look.position)
+    document["notices"] += forecasts.delays(twin, look.position, beats)
+    document["notices"] += forecasts.unheard(look, beats)
     document["notices"] += forecasts.doubts(twin, kinds)
     if missing := lacks(look.active.specification, twin.specification):
         what = ", ".join(missing[:5]) + (f" and {len(missing) - 5} more" if len(missing) > 5 else "")
