@@ -12,6 +12,7 @@ from service.fleet.ownership import Ownership
 from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
+from service.live.judging import Judge, in_units
 from service.live.tracker import Tracker
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
@@ -19,15 +20,14 @@ from service.store.alarms import FORECAST, MEASURED, AlarmRow, Limit
 from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import LeaseLost, TwinGone
+from service.store.quarters import EVER_US
 from service.store.samples import Samples
 from service.stream.hub import Hub
 from service.stream.messages import EventStretch, Stretch
 from service.twins.registry import Entry
 from service.workbench.interface import Forecasted
-from twin_core.anomaly.limits import LEAST_BAND, NOISES, Ahead, reaches, watch
+from twin_core.anomaly.limits import Ahead, reaches
 from twin_core.errors import TwinError
-from twin_core.quality.sentinels import marked
-from twin_core.units import to_si
 
 log = logging.getLogger("service.live")
 
@@ -130,7 +130,7 @@ class LimitWatch:
 
 
 def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
-    """Watch what arrived since the last look; what is older than that raises nothing."""
+    """Judge what arrived since the last look, each channel by itself: none waits for the others, nor is passed by them."""
     seq, state = alarms.watched(connection, twin.key)
     latest, n = samples.latest_seq(connection, twin.key), len(twin.channels)
     if seq < 0:
@@ -139,23 +139,20 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         _, found = samples.since_seq(connection, twin.key, n, seq)
         order = np.argsort(found.time_us, kind="stable")
         fresh = Samples(found.time_us[order], found.values[:, order])
-    new = fresh.time_us > state.get("time_us", -(2**62))
-    time_us, values = fresh.time_us[new], fresh.values[:, new]
-    if not time_us.size:
+    if not fresh.time_us.size:
         return None, ()
-    after: Json = {"time_us": int(time_us[-1])}
+    marks: dict[str, int] = state.get("marks", {})
+    before_us: int = state.get("time_us", -EVER_US)  # what earlier releases noted for all channels together
+    after: Json = {"marks": {}}
+    lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
     news: list[AlarmRow] = []
     for limit in limits_of(twin, MEASURED):
+        judge = Judge(connection, twin, limit, lasting.get(limit))
         key = f"{limit.channel}/{limit.colour}/{limit.side}"
-        column, unit = values[twin.channels.index(limit.channel)], twin.units[limit.channel]
-        if unit in ("K", "degC"):
-            column = np.where(marked(to_si(column, unit), unit), np.nan, column)
-        band = _band(twin, limit)
-        after[key], crossings = watch(state.get(key, {}), limit.bound, limit.side, band, time_us, column)  # type: ignore[arg-type]
-        for crossing in crossings:
-            body = {"unit": unit, "worst": crossing.worst, "message": _says(limit, unit, crossing.worst)}
-            row = alarms.write(connection, twin.key, limit, crossing.start, crossing.stop, body)
-            news += [] if row is None else [row]
+        judge.resume(state.get(key, {}), marks.get(limit.channel, before_us))
+        judge.arrived(fresh.time_us, fresh.values)
+        after[key], after["marks"][limit.channel] = judge.state, judge.mark_us
+        news += judge.news
     alarms.watch(connection, twin.key, latest, after)
     return None, _told(connection, twin, news)
 
@@ -206,7 +203,7 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
     def when(seconds: float | None) -> str | None:
         return None if seconds is None else format_instant(from_us + round(seconds) * 1_000_000)
 
-    bound = _bound(limit, unit)
+    bound = in_units(limit, unit)
     if ahead.expected_s is None:
         first = "" if ahead.earliest_s is None else f" in {in_words(ahead.earliest_s)} at the earliest"
         message = f"{limit.channel} may reach {bound}{first}"
@@ -216,21 +213,6 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
         message += f" (90 %: {in_words(ahead.earliest_s or 0.0)} to {latest})"
     ends = {"expected": ahead.expected_s, "earliest": ahead.earliest_s, "latest": ahead.latest_s}
     return {"unit": unit, "message": message} | {name: when(seconds) for name, seconds in ends.items()}
-
-
-def _band(twin: Entry, limit: Limit) -> float:
-    noise = twin.spec.channels[limit.channel].noise_std
-    return LEAST_BAND if noise is None else NOISES * float(noise)
-
-
-def _says(limit: Limit, unit: str | None, worst: float) -> str:
-    where = "above" if limit.side == "high" else "below"
-    return f"{limit.channel} is {where} {_bound(limit, unit)}: {worst:.4g} at worst"
-
-
-def _bound(limit: Limit, unit: str | None) -> str:
-    """Return a limit as an operator says it."""
-    return f"its {limit.colour} limit of {limit.bound:g} {'°C' if unit == 'degC' else unit or ''}".rstrip()
 
 
 def _told(connection: Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:

@@ -113,6 +113,13 @@ def write(
     return get(connection, twin, number)
 
 
+def change(connection: Connection, twin: int, number: int, start_us: int, stop_us: int | None, body: Json) -> AlarmRow:
+    """Write down what is known of an alarm by now, and return it."""
+    query = "UPDATE alarm SET start_us = ?, stop_us = ?, body = ? WHERE id = ?"
+    connection.execute(query, (start_us, stop_us, orjson.dumps(body).decode(), number))
+    return get(connection, twin, number)
+
+
 def end(connection: Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
     """End an alarm that lasts."""
     connection.execute(
@@ -134,6 +141,17 @@ def lasting(connection: Connection, twin: int) -> list[AlarmRow]:
     """Return the alarms that last."""
     query = _SELECT + "WHERE twin = ? AND stop_us IS NULL ORDER BY id"
     return [_row(row) for row in connection.execute(query, (twin,))]
+
+
+def between(connection: Connection, twin: int, limit: Limit, first_us: int, last_us: int) -> list[AlarmRow]:
+    """Return the alarms of a limit that lasted at any time from one instant to another, in their order."""
+    query = (
+        _SELECT
+        + """WHERE twin = ? AND origin = ? AND channel = ? AND colour = ? AND side = ? AND bound = ?
+             AND start_us <= ? AND (stop_us IS NULL OR stop_us >= ?) ORDER BY start_us, id"""
+    )
+    place = (limit.origin, limit.channel, limit.colour, limit.side, limit.bound)
+    return [_row(row) for row in connection.execute(query, (twin, *place, last_us, first_us))]
 
 
 def select(connection: Connection, twin: int, most: int) -> list[AlarmRow]:

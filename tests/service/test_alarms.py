@@ -2,12 +2,16 @@
 
 import copy
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from service.store import alarms as store
+from service.store import samples
+from service.store.connection import Connection
 from service.workbench.interface import Forecasted, ForecastTask
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
@@ -98,13 +102,81 @@ def test_each_side_and_each_kind_of_channel(client: AppClient) -> None:
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 2.0' in text
 
 
-def test_markers_of_missing_samples_and_late_samples_raise_nothing(client: AppClient) -> None:
+def test_markers_of_missing_samples_raise_nothing(client: AppClient) -> None:
     send(client, [0, 1, 2, 3], [290.0, -999.0, -999.0, 290.0], T_tank=[41.0] * 4)
     alarms(client, 1, channel="T_tank")
-    send(client, [0.2, 0.4], [320.0, 320.0])  # of the past
     send(client, [10, 11], [290.0, 290.0], T_tank=[41.0] * 2, Q_px=[150.0, 150.0])
     alarms(client, 1, channel="Q_px")
     assert {row["channel"] for row in alarms(client, 2)} == {"T_tank", "Q_px"}
+
+
+def send_one(client: AppClient, channel: str, times: list[float], values: list[float]) -> None:
+    """Send one channel by itself, and wait until it was looked at."""
+    body = {"time": times, "values": {channel: values}}
+    assert client.post(f"{TWIN}/telemetry", json=body).status_code == 200
+    until(lambda: read(client, lambda connection, twin: not unseen(connection, twin)))
+
+
+def read(client: AppClient, question: Callable[[Connection, int], Any]) -> Any:
+    """Return what the database answers about the twin."""
+    service = client.app.state.service
+    return client.portal.call(lambda: service.database.read(question, service.registry.get("benchsat").key))
+
+
+def unseen(connection: Connection, twin: int) -> int:
+    """Return how many samples nobody has looked at."""
+    seq, _ = store.watched(connection, twin)
+    return int(samples.since_seq(connection, twin, len(LIMITED["channels"]), seq)[0].size)
+
+
+def told(client: AppClient) -> list[tuple[str, str, bool]]:
+    """Return what the stream said of alarms: channel, colour, whether it lasts."""
+    found = [m["alarm"] for m in messages(client) if m["type"] == "alarm"]
+    return [(row["channel"], row["colour"], row["stop"] is None) for row in found]
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 60.0])
+def test_a_channel_that_never_arrives_first_is_judged_by_itself(client: AppClient, ahead_s: float) -> None:
+    for k in range(4):
+        send_one(client, "Q_px", [k + ahead_s], [0.5])
+        send_one(client, "T_px", [float(k)], [305.0])
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:00Z", None)
+
+
+def test_a_recorder_dump_raises_an_alarm_that_is_over(client: AppClient) -> None:
+    send_one(client, "T_px", [100.0, 101.0, 102.0], [290.0] * 3)
+    send_one(client, "T_px", [10.0 + k for k in range(50)], [305.0] * 50)
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:10Z", "1970-01-01T00:01:40Z")
+    assert alarm["message"] == "T_px was above its yellow limit of 300 K: 305 at worst"
+    send_one(client, "T_px", [5.0, 6.0, 70.0], [305.0] * 3)  # the same alarm, known better
+    (alarm,) = alarms(client, 1)
+    assert alarm["start"] == "1970-01-01T00:00:05Z"
+    send_one(client, "T_px", [103.0, 104.0], [305.0] * 2)
+    alarms(client, 2)
+    assert told(client) == [("T_px", "yellow", False), ("T_px", "yellow", True)]
+
+
+def test_one_reading_ahead_of_the_others_hides_nothing(client: AppClient) -> None:
+    send_one(client, "T_px", [290.0], [290.0])
+    for k in range(5):  # one by one: each is looked at beside the one before
+        send_one(client, "T_px", [float(k)], [305.0])
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:00Z", None)
+    send_one(client, "T_px", [291.0], [290.0])
+    alarms(client, 1, stop="1970-01-01T00:04:50Z")
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
+
+
+def test_late_readings_neither_end_nor_repeat_an_alarm_that_lasts(client: AppClient) -> None:
+    send_one(client, "T_px", [100.0, 101.0, 110.0, 111.0], [305.0] * 4)
+    send_one(client, "T_px", [104.0, 105.0], [290.0] * 2)
+    send_one(client, "T_px", [50.0, 51.0, 52.0, 53.0], [305.0, 305.0, 290.0, 290.0])
+    now, before = alarms(client, 2)
+    assert (now["start"], now["stop"]) == ("1970-01-01T00:01:40Z", None)
+    assert (before["start"], before["stop"]) == ("1970-01-01T00:00:50Z", "1970-01-01T00:00:52Z")
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
 
 
 def test_an_alarm_survives_a_restart_as_one(make_client) -> None:
