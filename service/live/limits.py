@@ -73,12 +73,14 @@ class LimitWatch:
         self._loop = asyncio.get_running_loop()
         self._due: dict[int, Entry] = {}
         self._foreseen_s: dict[int, float] = {}
+        self._without: set[int] = set()
+        """Twins without limits, and without alarms of limits that they had."""
         self._wake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def arrived(self, twin: Entry) -> None:
         """Hear that samples were stored, or taken away."""
-        if self._ownership.owns(twin.key) and limits_of(twin, MEASURED):
+        if self._ownership.owns(twin.key) and (twin.key not in self._without or limits_of(twin, MEASURED)):
             self._due[twin.key] = twin
             self._wake.set()
 
@@ -86,6 +88,7 @@ class LimitWatch:
         """Watch a twin no longer."""
         self._due.pop(twin.key, None)
         self._foreseen_s.pop(twin.key, None)
+        self._without.discard(twin.key)
 
     async def close(self) -> None:
         """Stop."""
@@ -99,7 +102,11 @@ class LimitWatch:
             due, self._due = self._due, {}
             for twin in due.values():
                 try:
-                    await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                    has_any = bool(limits_of(twin, MEASURED))
+                    if has_any or await self._database.read(alarms.lasting, twin.key):
+                        await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                    if not has_any:
+                        self._without.add(twin.key)
                     await self._foresee(twin)
                 except (TwinGone, LeaseLost):
                     continue
@@ -139,22 +146,36 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         _, found = samples.since_seq(connection, twin.key, n, seq)
         order = np.argsort(found.time_us, kind="stable")
         fresh = Samples(found.time_us[order], found.values[:, order])
+    news = _lapsed(connection, twin)
     if not fresh.time_us.size:
-        return None, ()
+        return None, _told(connection, twin, news)
     marks: dict[str, int] = state.get("marks", {})
     before_us: int = state.get("time_us", -EVER_US)  # what earlier releases noted for all channels together
     after: Json = {"marks": {}}
     lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
-    news: list[AlarmRow] = []
     for limit in limits_of(twin, MEASURED):
         judge = Judge(connection, twin, limit, lasting.get(limit))
-        key = f"{limit.channel}/{limit.colour}/{limit.side}"
+        key = f"{limit.channel}/{limit.colour}/{limit.side}/{limit.bound!r}"
         judge.resume(state.get(key, {}), marks.get(limit.channel, before_us))
         judge.arrived(fresh.time_us, fresh.values)
         after[key], after["marks"][limit.channel] = judge.state, judge.mark_us
         news += judge.news
     alarms.watch(connection, twin.key, latest, after)
     return None, _told(connection, twin, news)
+
+
+def _lapsed(connection: Connection, twin: Entry) -> list[AlarmRow]:
+    """End the alarms whose limit the specification has no more, or has elsewhere, at the end of the archive."""
+    limits = {limit for origin in (MEASURED, FORECAST) for limit in limits_of(twin, origin)}
+    places = {(limit.origin, limit.channel, limit.colour, limit.side) for limit in limits}
+    ended = []
+    for row in alarms.lasting(connection, twin.key):
+        if row.limit not in limits:
+            place = (row.limit.origin, row.limit.channel, row.limit.colour, row.limit.side)
+            why = "the limit was changed" if place in places else "the limit was removed"
+            last_us = samples.last_us(connection, twin.key)
+            ended.append(alarms.end(connection, twin.key, row.id, row.start_us if last_us is None else last_us, why))
+    return ended
 
 
 def foresee(

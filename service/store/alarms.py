@@ -94,7 +94,8 @@ def write(
     place = (twin, limit.origin, limit.channel, limit.colour, limit.side)
     where = "WHERE twin = ? AND origin = ? AND channel = ? AND colour = ? AND side = ?"
     text = orjson.dumps(body).decode()
-    known = connection.execute(f"SELECT id FROM alarm {where} AND start_us = ?", (*place, start_us)).fetchone()
+    query = f"SELECT id FROM alarm {where} AND bound = ? AND start_us = ?"
+    known = connection.execute(query, (*place, limit.bound, start_us)).fetchone()
     if known is not None:
         query = "UPDATE alarm SET stop_us = ?, body = ? WHERE id = ?"
         connection.execute(query, (stop_us, text, known[0]))
@@ -120,13 +121,11 @@ def change(connection: Connection, twin: int, number: int, start_us: int, stop_u
     return get(connection, twin, number)
 
 
-def end(connection: Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
-    """End an alarm that lasts."""
-    connection.execute(
-        "UPDATE alarm SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END WHERE id = ?",
-        (stop_us, stop_us, number),
-    )
-    return get(connection, twin, number)
+def end(connection: Connection, twin: int, number: int, stop_us: int, why: str | None = None) -> AlarmRow:
+    """End an alarm that lasts; ``why``, where it is not that readings came back, is added to what it says."""
+    row = get(connection, twin, number)
+    body = row.body if why is None else row.body | {"message": f"{row.body['message']}; {why}"}
+    return change(connection, twin, number, row.start_us, max(row.start_us, stop_us), body)
 
 
 def get(connection: Connection, twin: int, number: int) -> AlarmRow:

@@ -214,6 +214,23 @@ def test_acknowledging_and_shelving(client: AppClient) -> None:
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 1.0' in client.get("/metrics").text
 
 
+@pytest.mark.parametrize(
+    ("limits", "why"), [({"red": [None, 500.0]}, "removed"), (None, "removed"), ({"yellow": [None, 302.0]}, "changed")]
+)
+def test_a_limit_that_is_removed_ends_its_alarm(client: AppClient, limits: dict | None, why: str) -> None:
+    send(client, [0, 1], [303.0, 303.0])
+    alarms(client, 1, stop=None)
+    revised = copy.deepcopy(SPEC)
+    if limits is not None:
+        revised["channels"]["T_px"]["limits"] = limits
+    assert client.request("PUT", TWIN, json=revised).status_code == 200
+    (ended,) = alarms(client, 1, stop="1970-01-01T00:00:01Z")
+    assert ended["message"] == f"T_px was above its yellow limit of 300 K: 303 at worst; the limit was {why}"
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
+    send(client, [2, 3], [303.0, 303.0])
+    alarms(client, int(why == "changed"), stop=None)
+
+
 def calibrate(client: AppClient) -> None:
     path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
     while client.get(path).json()["state"] in ("queued", "running"):
