@@ -15,6 +15,8 @@ from twin_core.anomaly.limits import LEAST_BAND, NOISES, Crossing, watch
 from twin_core.quality.sentinels import marked
 from twin_core.units import to_si
 
+MOST_PAST = 100_000
+"""Of an archive that nobody has watched so far, so many of the newest samples are looked through; after a deletion no more."""
 SETTLING = 10_000
 """So many samples behind late ones are looked through again at first, more where an alarm still lasts there."""
 BACK_US = (3_600_000_000, 86_400_000_000)
@@ -44,6 +46,38 @@ class Judge:
         """Go on from where the last look ended; the alarm of the store counts."""
         self.state = state | {"start": None if self._lasting is None else self._lasting.start_us}
         self.mark_us = mark_us
+
+    def taken(self, start_us: int, stop_us: int) -> None:
+        """Let go of what stood on readings that were taken out of the archive; the past is not told again."""
+        for row in alarms.between(self._connection, self._twin.key, self._limit, start_us, stop_us):
+            if row.stop_us is not None and not self._between(row.start_us, row.stop_us)[0].size:
+                alarms.remove(self._connection, self._twin.key, row.id)
+        if self._lasting is not None:
+            self._stand_on_what_is_left(self._lasting, start_us)
+        elif self.state.get("first") is not None and not self._has(self.state["first"]):
+            self.state = {}
+        if start_us <= self.mark_us < stop_us and not self._has(self.mark_us):
+            self.mark_us = start_us - 1
+
+    def _stand_on_what_is_left(self, row: AlarmRow, taken_us: int) -> None:
+        """Go on with an alarm that lasts where the readings that are left still say so, and end it where they do not."""
+        newest_us = samples.nth_newest_us(self._connection, self._twin.key, MOST_PAST)
+        from_us = row.start_us if newest_us is None else max(row.start_us, newest_us)
+        has_begun = self._has(row.start_us) or from_us > row.start_us
+        worst = 0.0 if from_us == row.start_us else self._sign * (row.body["worst"] - self._limit.bound)
+        before: Json = {"start": row.start_us, "worst": worst} if has_begun else {}
+        state, crossings = self._watch(before, *self._between(from_us, self.mark_us + 1))
+        if state["start"] is not None:
+            start_us = row.start_us if has_begun else crossings[0].start
+            farthest = [self._sign * crossing.worst for crossing in crossings]
+            body = self._body(self._sign * max(farthest)) if farthest else row.body
+            self._lasting = alarms.change(self._connection, self._twin.key, row.id, start_us, None, body)
+        else:
+            back_us, why = (crossings[-1].stop, None) if crossings else (None, "its readings were taken away")
+            stop_us = max(taken_us, row.start_us) if back_us is None else back_us
+            self.news.append(alarms.end(self._connection, self._twin.key, row.id, stop_us, why))
+            self._lasting = None
+        self.resume(state, self.mark_us)
 
     def arrived(self, time_us: NDArray[np.int64], values: NDArray[np.float64]) -> None:
         """Judge what arrived since the last look, (n_channels, n_times) in the order of time."""
@@ -144,6 +178,9 @@ class Judge:
             if before:
                 break
         return instants[max(before - 1, 0) :], readings[max(before - 1, 0) :]
+
+    def _has(self, instant_us: int) -> bool:
+        return bool(self._between(instant_us, instant_us + 1)[0].size)
 
     def _between(self, start_us: int, stop_us: int | None) -> Readings:
         held = samples.select(

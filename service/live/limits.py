@@ -12,7 +12,7 @@ from service.fleet.ownership import Ownership
 from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
-from service.live.judging import Judge, in_units
+from service.live.judging import MOST_PAST, Judge, in_units
 from service.live.tracker import Tracker
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
@@ -36,8 +36,6 @@ Json = dict[str, Any]
 PAUSE_S = 0.2
 """Shortest time between two looks, so that samples sent one by one are watched together."""
 FORECAST_EVERY_S = 60.0
-MOST_PAST = 100_000
-"""Of an archive that nobody has watched so far, so many of the newest samples are looked through."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 STEPS = 180
 
@@ -147,7 +145,8 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         order = np.argsort(found.time_us, kind="stable")
         fresh = Samples(found.time_us[order], found.values[:, order])
     news = _lapsed(connection, twin)
-    if not fresh.time_us.size:
+    taken = state.get("taken")
+    if not fresh.time_us.size and taken is None:
         return None, _told(connection, twin, news)
     marks: dict[str, int] = state.get("marks", {})
     before_us: int = state.get("time_us", -EVER_US)  # what earlier releases noted for all channels together
@@ -157,6 +156,8 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         judge = Judge(connection, twin, limit, lasting.get(limit))
         key = f"{limit.channel}/{limit.colour}/{limit.side}/{limit.bound!r}"
         judge.resume(state.get(key, {}), marks.get(limit.channel, before_us))
+        if taken is not None:
+            judge.taken(*taken)
         judge.arrived(fresh.time_us, fresh.values)
         after[key], after["marks"][limit.channel] = judge.state, judge.mark_us
         news += judge.news

@@ -128,6 +128,11 @@ def end(connection: Connection, twin: int, number: int, stop_us: int, why: str |
     return change(connection, twin, number, row.start_us, max(row.start_us, stop_us), body)
 
 
+def remove(connection: Connection, twin: int, number: int) -> None:
+    """Forget an alarm."""
+    connection.execute("DELETE FROM alarm WHERE twin = ? AND id = ?", (twin, number))
+
+
 def get(connection: Connection, twin: int, number: int) -> AlarmRow:
     """Return one alarm; Missing if there is none of that number."""
     row = connection.execute(_SELECT + "WHERE twin = ? AND id = ?", (twin, number)).fetchone()
@@ -193,3 +198,11 @@ def watch(connection: Connection, twin: int, seq: int, state: Json) -> None:
     query = """INSERT INTO watched (twin, seq, state) VALUES (?, ?, ?)
                ON CONFLICT (twin) DO UPDATE SET seq = excluded.seq, state = excluded.state"""
     connection.execute(query, (twin, seq, orjson.dumps(state).decode()))
+
+
+def taken(connection: Connection, twin: int, start_us: int, stop_us: int) -> None:
+    """Note that samples were taken out of the archive: the next look asks which alarms still stand, and tells nothing again."""
+    seq, state = watched(connection, twin)
+    if seq >= 0:
+        before = state.get("taken", [start_us, stop_us])
+        watch(connection, twin, seq, state | {"taken": [min(start_us, before[0]), max(stop_us, before[1])]})

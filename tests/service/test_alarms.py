@@ -272,14 +272,58 @@ def test_a_forecast_alarm_gives_way_to_the_measured_one(client: AppClient, monke
     alarms(client, 1, on="forecast", colour="red", stop=None)
 
 
+def take_away(client: AppClient, start: float, stop: float, **more: str) -> None:
+    """Delete samples, and wait until that was looked at."""
+    params = {"start": start, "stop": stop, **more}
+    assert client.request("DELETE", f"{TWIN}/telemetry", params=params).status_code == 200
+    until(lambda: "taken" not in read(client, store.watched)[1])
+
+
 def test_a_deletion_takes_its_alarms_along(client: AppClient) -> None:
-    send(client, [0, 1, 2, 3], [290.0, 340.0, 340.0, 290.0])
-    alarms(client, 2)
-    client.request("DELETE", f"{TWIN}/telemetry", params={"start": 1, "stop": 3})
-    alarms(client, 0)
-    send(client, [4, 5], [301.0, 301.0])
-    (left,) = alarms(client, 1)
-    assert left["start"] == "1970-01-01T00:00:04Z"
+    send(client, [0, 1, 2, 3, 4, 5, 6], [290.0, 305.0, 305.0, 290.0, 290.0, 340.0, 340.0])
+    alarms(client, 3)
+    take_away(client, 1, 3)
+    alarms(client, 2, stop=None)
+    take_away(client, 5, 7)
+    assert [row["start"] for row in alarms(client, 2)] == ["1970-01-01T00:00:05Z"] * 2
+    (ended,) = alarms(client, 1, stop="1970-01-01T00:00:05Z", colour="yellow")
+    assert ended["message"].endswith("340 at worst; its readings were taken away")
+    assert len(told(client)) == 5  # three began, of which one was over at once, and two ended
+    send(client, [5, 6], [301.0, 301.0])
+    (left,) = alarms(client, 1, stop=None)
+    assert left["start"] == "1970-01-01T00:00:05Z"
+
+
+def test_a_deletion_repeats_nothing_and_leaves_one_alarm(client: AppClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    send_one(client, "T_px", [0.0, 1.0, 2.0, 3.0], [305.0, 305.0, 290.0, 290.0])
+    send_one(client, "T_px", [float(k) for k in range(10, 20)], [303.0, 303.0, 308.0] + [304.0] * 7)
+    monkeypatch.setattr("service.live.judging.MOST_PAST", 3)
+    before = told(client)
+    assert before == [("T_px", "yellow", False), ("T_px", "yellow", True)]
+    take_away(client, 12, 13)  # the worst of the alarm that lasts
+    take_away(client, 1, 2)
+    take_away(client, 0, 1, channels="Q_px")
+    past, now = sorted(alarms(client, 2), key=lambda row: row["start"])
+    assert (past["start"], past["stop"]) == ("1970-01-01T00:00:00Z", "1970-01-01T00:00:02Z")
+    assert (now["start"], now["stop"]) == ("1970-01-01T00:00:10Z", None)
+    assert told(client) == before
+    take_away(client, 10, 12)
+    alarms(client, 1, stop=None)
+    send_one(client, "T_px", [20.0, 21.0], [290.0, 290.0])
+    alarms(client, 0, stop=None)
+    assert told(client) == [*before, ("T_px", "yellow", False)]
+
+
+def test_what_a_deletion_leaves_of_an_alarm(client: AppClient) -> None:
+    send_one(client, "T_px", [0.0, 1.0, 2.0, 3.0, 4.0], [309.0, 309.0, 303.0, 303.0, 303.0])
+    take_away(client, 0, 2)
+    (alarm,) = alarms(client, 1, stop=None)
+    assert (alarm["start"], alarm["worst"]) == ("1970-01-01T00:00:02Z", 303.0)
+    take_away(client, 3, 5)
+    alarms(client, 1, stop=None, worst=303.0)
+    take_away(client, 2, 3)
+    alarms(client, 0, stop=None)
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
 
 
 WRONG = (
