@@ -71,13 +71,14 @@ class LimitWatch:
         self._loop = asyncio.get_running_loop()
         self._due: dict[int, Entry] = {}
         self._foreseen_s: dict[int, float] = {}
+        self._timers: dict[int, asyncio.TimerHandle] = {}
         self._without: set[int] = set()
         """Twins without limits, and without alarms of limits that they had."""
         self._wake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def arrived(self, twin: Entry) -> None:
-        """Hear that samples were stored, or taken away."""
+        """Hear that samples were stored, or taken away, or that a limit was shelved or taken up again."""
         if self._ownership.owns(twin.key) and (twin.key not in self._without or limits_of(twin, MEASURED)):
             self._due[twin.key] = twin
             self._wake.set()
@@ -87,6 +88,7 @@ class LimitWatch:
         self._due.pop(twin.key, None)
         self._foreseen_s.pop(twin.key, None)
         self._without.discard(twin.key)
+        self._look_at(twin, None)
 
     async def close(self) -> None:
         """Stop."""
@@ -101,8 +103,10 @@ class LimitWatch:
             for twin in due.values():
                 try:
                     has_any = bool(limits_of(twin, MEASURED))
-                    if has_any or await self._database.read(alarms.lasting, twin.key):
-                        await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                    left = [] if has_any else await self._database.read(alarms.lasting, twin.key)
+                    if has_any or left:
+                        until_us = await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                        self._look_at(twin, until_us)
                     if not has_any:
                         self._without.add(twin.key)
                     await self._foresee(twin)
@@ -111,6 +115,14 @@ class LimitWatch:
                 except Exception:
                     log.exception("limits could not be watched", extra={"twin": twin.name})
             await asyncio.sleep(PAUSE_S)
+
+    def _look_at(self, twin: Entry, at_us: int | None) -> None:
+        """Look again at an instant of the clock, even if nothing arrives."""
+        timer = self._timers.pop(twin.key, None)
+        if timer is not None:
+            timer.cancel()
+        if at_us is not None:
+            self._timers[twin.key] = self._loop.call_later(max(at_us - now_us(), 0) / 1e6, self.arrived, twin)
 
     async def _foresee(self, twin: Entry) -> None:
         """Look ahead, unless that was done just now."""
@@ -134,7 +146,13 @@ class LimitWatch:
         )
 
 
-def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
+def look(connection: Connection, twin: Entry) -> tuple[int | None, Sequence[Stretch]]:
+    """Judge what arrived since the last look; return when to look again for an alarm that is shelved until then."""
+    told = _told(connection, twin, _judged(connection, twin))
+    return _taken_up_us(connection, twin), told
+
+
+def _judged(connection: Connection, twin: Entry) -> list[AlarmRow]:
     """Judge what arrived since the last look, each channel by itself: none waits for the others, nor is passed by them."""
     seq, state = alarms.watched(connection, twin.key)
     latest, n = samples.latest_seq(connection, twin.key), len(twin.channels)
@@ -147,10 +165,10 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
     news = _lapsed(connection, twin)
     taken = state.get("taken")
     if not fresh.time_us.size and taken is None:
-        return None, _told(connection, twin, news)
+        return news
     marks: dict[str, int] = state.get("marks", {})
     before_us: int = state.get("time_us", -EVER_US)  # what earlier releases noted for all channels together
-    after: Json = {"marks": {}}
+    after: Json = {"marks": {}, "untold": state.get("untold", [])}
     lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
     for limit in limits_of(twin, MEASURED):
         judge = Judge(connection, twin, limit, lasting.get(limit))
@@ -162,7 +180,7 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         after[key], after["marks"][limit.channel] = judge.state, judge.mark_us
         news += judge.news
     alarms.watch(connection, twin.key, latest, after)
-    return None, _told(connection, twin, news)
+    return news
 
 
 def _lapsed(connection: Connection, twin: Entry) -> list[AlarmRow]:
@@ -238,8 +256,24 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
 
 
 def _told(connection: Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:
-    """Return the messages that tell of alarms; nobody hears of those that are shelved."""
-    messages = [("alarm", {"alarm": row.wire()}) for row in news if not row.is_shelved(now_us())]
+    """Return the messages that tell of alarms; of those that are shelved others hear once they are not, if they still last."""
+    seq, state = alarms.watched(connection, twin.key)
+    at_us, lasting = now_us(), {row.id: row for row in alarms.lasting(connection, twin.key)}
+    before: list[int] = state.get("untold", [])
+    began = [row.id for row in news if row.stop_us is None]
+    untold = [number for number in (*before, *began) if number in lasting and lasting[number].is_shelved(at_us)]
+    if untold != before:
+        alarms.watch(connection, twin.key, seq, state | {"untold": untold})
+    due = [lasting[number] for number in before if number in lasting]
+    messages = [("alarm", {"alarm": row.wire()}) for row in (*due, *news) if not row.is_shelved(at_us)]
     if not messages:
         return ()
     return [EventStretch(tuple(events.append(connection, twin.key, now_us(), messages)))]
+
+
+def _taken_up_us(connection: Connection, twin: Entry) -> int | None:
+    """Return when the first alarm that lasts and was not told of is shelved no more."""
+    _, state = alarms.watched(connection, twin.key)
+    untold = state.get("untold", [])
+    until = (row.shelved_until_us for row in alarms.lasting(connection, twin.key) if row.id in untold)
+    return min((until_us for until_us in until if until_us is not None), default=None)

@@ -214,6 +214,24 @@ def test_acknowledging_and_shelving(client: AppClient) -> None:
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 1.0' in client.get("/metrics").text
 
 
+@pytest.mark.parametrize("is_taken_up", [True, False])
+def test_an_alarm_that_began_while_shelved_is_told_once_it_is_not(client: AppClient, is_taken_up: bool) -> None:
+    send(client, [0, 1, 2, 3], [301.0, 301.0, 290.0, 290.0])
+    (alarm,) = alarms(client, 1)
+    shelve_s = 3600.0 if is_taken_up else 2.0
+    path = f"{TWIN}/alarms/{alarm['id']}/shelve"
+    assert client.post(path, json={"for_s": shelve_s}).status_code == 200
+    send_one(client, "T_px", [4.0, 5.0], [301.0, 301.0])
+    before = [("T_px", "yellow", False)]
+    assert told(client) == before
+    if is_taken_up:
+        client.post(path, json={"for_s": 0})
+    until(lambda: told(client) == [*before, ("T_px", "yellow", True)])
+    send_one(client, "T_px", [6.0, 7.0, 8.0], [301.0, 290.0, 290.0])
+    alarms(client, 0, stop=None)
+    assert told(client) == [*before, ("T_px", "yellow", True), ("T_px", "yellow", False)]
+
+
 @pytest.mark.parametrize(
     ("limits", "why"), [({"red": [None, 500.0]}, "removed"), (None, "removed"), ({"yellow": [None, 302.0]}, "changed")]
 )
