@@ -13,6 +13,7 @@ from service.fleet.ownership import Ownership
 from service.instants import format_instant, in_words, now_us
 from service.live import forecasts
 from service.live.engine import Engine
+from service.live.judging import MOST_PAST, Judge, in_units, is_beyond
 from service.live.tracker import Tracker
 from service.schemas import ForecastRequest
 from service.store import alarms, events, samples
@@ -20,15 +21,14 @@ from service.store.alarms import FORECAST, MEASURED, AlarmRow, Limit
 from service.store.connection import Connection
 from service.store.database import Database
 from service.store.errors import LeaseLost, TwinGone
+from service.store.quarters import EVER_US
 from service.store.samples import Samples
 from service.stream.hub import Hub
 from service.stream.messages import EventStretch, Stretch
 from service.twins.registry import Entry
 from service.workbench.interface import Forecasted
-from twin_core.anomaly.limits import LEAST_BAND, NOISES, Ahead, reaches, watch
+from twin_core.anomaly.limits import Ahead, reaches
 from twin_core.errors import TwinError
-from twin_core.quality.sentinels import marked
-from twin_core.units import to_si
 
 log = logging.getLogger("service.live")
 
@@ -37,8 +37,6 @@ Json = dict[str, Any]
 PAUSE_S = 0.2
 """Shortest time between two looks, so that samples sent one by one are watched together."""
 FORECAST_EVERY_S = 60.0
-MOST_PAST = 100_000
-"""Of an archive that nobody has watched so far, so many of the newest samples are looked through."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 STEPS = 180
 
@@ -74,12 +72,15 @@ class LimitWatch:
         self._loop = asyncio.get_running_loop()
         self._due: dict[int, Entry] = {}
         self._foreseen_s: dict[int, float] = {}
+        self._timers: dict[int, asyncio.TimerHandle] = {}
+        self._without: set[int] = set()
+        """Twins without limits, and without alarms of limits that they had."""
         self._wake = asyncio.Event()
         self._task = asyncio.create_task(self._run())
 
     def arrived(self, twin: Entry) -> None:
-        """Hear that samples were stored, or taken away."""
-        if self._ownership.owns(twin.key) and limits_of(twin, MEASURED):
+        """Hear that samples were stored, or taken away, or that a limit was shelved or taken up again."""
+        if self._ownership.owns(twin.key) and (twin.key not in self._without or limits_of(twin, MEASURED)):
             self._due[twin.key] = twin
             self._wake.set()
 
@@ -87,6 +88,8 @@ class LimitWatch:
         """Watch a twin no longer."""
         self._due.pop(twin.key, None)
         self._foreseen_s.pop(twin.key, None)
+        self._without.discard(twin.key)
+        self._look_at(twin, None)
 
     async def close(self) -> None:
         """Stop."""
@@ -100,13 +103,27 @@ class LimitWatch:
             due, self._due = self._due, {}
             for twin in due.values():
                 try:
-                    await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                    has_any = bool(limits_of(twin, MEASURED))
+                    left = [] if has_any else await self._database.read(alarms.lasting, twin.key)
+                    if has_any or left:
+                        until_us = await self._hub.write(twin.key, self._ownership.guard(twin.key)(look), twin)
+                        self._look_at(twin, until_us)
+                    if not has_any:
+                        self._without.add(twin.key)
                     await self._foresee(twin)
                 except (TwinGone, LeaseLost):
                     continue
                 except Exception:
                     log.exception("limits could not be watched", extra={"twin": twin.name})
             await asyncio.sleep(PAUSE_S)
+
+    def _look_at(self, twin: Entry, at_us: int | None) -> None:
+        """Look again at an instant of the clock, even if nothing arrives."""
+        timer = self._timers.pop(twin.key, None)
+        if timer is not None:
+            timer.cancel()
+        if at_us is not None:
+            self._timers[twin.key] = self._loop.call_later(max(at_us - now_us(), 0) / 1e6, self.arrived, twin)
 
     async def _foresee(self, twin: Entry) -> None:
         """Look ahead, unless that was done just now."""
@@ -130,8 +147,14 @@ class LimitWatch:
         )
 
 
-def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
-    """Watch what arrived since the last look; what is older than that raises nothing."""
+def look(connection: Connection, twin: Entry) -> tuple[int | None, Sequence[Stretch]]:
+    """Judge what arrived since the last look; return when to look again for an alarm that is shelved until then."""
+    told = _told(connection, twin, _judged(connection, twin))
+    return _taken_up_us(connection, twin), told
+
+
+def _judged(connection: Connection, twin: Entry) -> list[AlarmRow]:
+    """Judge what arrived since the last look, each channel by itself: none waits for the others, nor is passed by them."""
     seq, state = alarms.watched(connection, twin.key)
     latest, n = samples.latest_seq(connection, twin.key), len(twin.channels)
     if seq < 0:
@@ -140,25 +163,39 @@ def look(connection: Connection, twin: Entry) -> tuple[None, Sequence[Stretch]]:
         _, found = samples.since_seq(connection, twin.key, n, seq)
         order = np.argsort(found.time_us, kind="stable")
         fresh = Samples(found.time_us[order], found.values[:, order])
-    new = fresh.time_us > state.get("time_us", -(2**62))
-    time_us, values = fresh.time_us[new], fresh.values[:, new]
-    if not time_us.size:
-        return None, ()
-    after: Json = {"time_us": int(time_us[-1])}
-    news: list[AlarmRow] = []
+    news = _lapsed(connection, twin)
+    taken = state.get("taken")
+    if not fresh.time_us.size and taken is None:
+        return news
+    marks: dict[str, int] = state.get("marks", {})
+    before_us: int = state.get("time_us", -EVER_US)  # what earlier releases noted for all channels together
+    after: Json = {"marks": {}, "untold": state.get("untold", [])}
+    lasting = {row.limit: row for row in alarms.lasting(connection, twin.key)}
     for limit in limits_of(twin, MEASURED):
-        key = f"{limit.channel}/{limit.colour}/{limit.side}"
-        column, unit = values[twin.channels.index(limit.channel)], twin.units[limit.channel]
-        if unit in ("K", "degC"):
-            column = np.where(marked(to_si(column, unit), unit), np.nan, column)
-        band = _band(twin, limit)
-        after[key], crossings = watch(state.get(key, {}), limit.bound, limit.side, band, time_us, column)  # type: ignore[arg-type]
-        for crossing in crossings:
-            body = {"unit": unit, "worst": crossing.worst, "message": _says(limit, unit, crossing.worst)}
-            row = alarms.write(connection, twin.key, limit, crossing.start, crossing.stop, body)
-            news += [] if row is None else [row]
+        judge = Judge(connection, twin, limit, lasting.get(limit))
+        key = f"{limit.channel}/{limit.colour}/{limit.side}/{limit.bound!r}"
+        judge.resume(state.get(key, {}), marks.get(limit.channel, before_us))
+        if taken is not None:
+            judge.taken(*taken)
+        judge.arrived(fresh.time_us, fresh.values)
+        after[key], after["marks"][limit.channel] = judge.state, judge.mark_us
+        news += judge.news
     alarms.watch(connection, twin.key, latest, after)
-    return None, _told(connection, twin, news)
+    return news
+
+
+def _lapsed(connection: Connection, twin: Entry) -> list[AlarmRow]:
+    """End the alarms whose limit the specification has no more, or has elsewhere, at the end of the archive."""
+    limits = {limit for origin in (MEASURED, FORECAST) for limit in limits_of(twin, origin)}
+    places = {(limit.origin, limit.channel, limit.colour, limit.side) for limit in limits}
+    ended = []
+    for row in alarms.lasting(connection, twin.key):
+        if row.limit not in limits:
+            place = (row.limit.origin, row.limit.channel, row.limit.colour, row.limit.side)
+            why = "the limit was changed" if place in places else "the limit was removed"
+            last_us = samples.last_us(connection, twin.key)
+            ended.append(alarms.end(connection, twin.key, row.id, row.start_us if last_us is None else last_us, why))
+    return ended
 
 
 def foresee(
@@ -206,7 +243,7 @@ def expected(twin: Entry, from_us: int, made: Forecasted, lasting: Collection[Li
         if ahead.earliest_s is not None:
             unit = twin.units[limit.channel]
             place = {"channel": limit.channel, "colour": limit.colour, "side": limit.side, "limit": limit.bound}
-            says = {"message": f"{_is_beyond(limit, unit)} already"} if is_there else {}
+            says = {"message": f"{is_beyond(limit, unit)} already"} if is_there else {}
             yield place | describe(limit, unit, from_us, ahead) | says
 
 
@@ -216,7 +253,7 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
     def when(seconds: float | None) -> str | None:
         return None if seconds is None else format_instant(from_us + round(seconds) * 1_000_000)
 
-    bound = _bound(limit, unit)
+    bound = in_units(limit, unit)
     if ahead.expected_s is None:
         first = "" if ahead.earliest_s is None else f" in {in_words(ahead.earliest_s)} at the earliest"
         message = f"{limit.channel} may reach {bound}{first}"
@@ -228,27 +265,25 @@ def describe(limit: Limit, unit: str | None, from_us: int, ahead: Ahead) -> Json
     return {"unit": unit, "message": message} | {name: when(seconds) for name, seconds in ends.items()}
 
 
-def _band(twin: Entry, limit: Limit) -> float:
-    noise = twin.spec.channels[limit.channel].noise_std
-    return LEAST_BAND if noise is None else NOISES * float(noise)
-
-
-def _says(limit: Limit, unit: str | None, worst: float) -> str:
-    return f"{_is_beyond(limit, unit)}: {worst:.4g} at worst"
-
-
-def _is_beyond(limit: Limit, unit: str | None) -> str:
-    return f"{limit.channel} is {'above' if limit.side == 'high' else 'below'} {_bound(limit, unit)}"
-
-
-def _bound(limit: Limit, unit: str | None) -> str:
-    """Return a limit as an operator says it."""
-    return f"its {limit.colour} limit of {limit.bound:g} {'°C' if unit == 'degC' else unit or ''}".rstrip()
-
-
 def _told(connection: Connection, twin: Entry, news: Sequence[AlarmRow]) -> Sequence[Stretch]:
-    """Return the messages that tell of alarms; nobody hears of those that are shelved."""
-    messages = [("alarm", {"alarm": row.wire()}) for row in news if not row.is_shelved(now_us())]
+    """Return the messages that tell of alarms; of those that are shelved others hear once they are not, if they still last."""
+    seq, state = alarms.watched(connection, twin.key)
+    at_us, lasting = now_us(), {row.id: row for row in alarms.lasting(connection, twin.key)}
+    before: list[int] = state.get("untold", [])
+    began = [row.id for row in news if row.stop_us is None]
+    untold = [number for number in (*before, *began) if number in lasting and lasting[number].is_shelved(at_us)]
+    if untold != before:
+        alarms.watch(connection, twin.key, seq, state | {"untold": untold})
+    due = [lasting[number] for number in before if number in lasting]
+    messages = [("alarm", {"alarm": row.wire()}) for row in (*due, *news) if not row.is_shelved(at_us)]
     if not messages:
         return ()
     return [EventStretch(tuple(events.append(connection, twin.key, now_us(), messages)))]
+
+
+def _taken_up_us(connection: Connection, twin: Entry) -> int | None:
+    """Return when the first alarm that lasts and was not told of is shelved no more."""
+    _, state = alarms.watched(connection, twin.key)
+    untold = state.get("untold", [])
+    until = (row.shelved_until_us for row in alarms.lasting(connection, twin.key) if row.id in untold)
+    return min((until_us for until_us in until if until_us is not None), default=None)

@@ -168,6 +168,10 @@ class Live:
         if tracker is not None:
             tracker.archive_changed()
 
+    def shelved(self, twin: Entry) -> None:
+        """Pass on that a limit was shelved, or taken up again."""
+        self._limits.arrived(twin)
+
     def model_changed(self, twin: int) -> None:
         """Pass on that another model is active."""
         tracker = self._trackers.get(twin)

@@ -94,7 +94,8 @@ def write(
     place = (twin, limit.origin, limit.channel, limit.colour, limit.side)
     where = "WHERE twin = ? AND origin = ? AND channel = ? AND colour = ? AND side = ?"
     text = orjson.dumps(body).decode()
-    known = connection.execute(f"SELECT id FROM alarm {where} AND start_us = ?", (*place, start_us)).fetchone()
+    query = f"SELECT id FROM alarm {where} AND bound = ? AND start_us = ?"
+    known = connection.execute(query, (*place, limit.bound, start_us)).fetchone()
     if known is not None:
         query = "UPDATE alarm SET stop_us = ?, body = ? WHERE id = ?"
         connection.execute(query, (stop_us, text, known[0]))
@@ -113,13 +114,23 @@ def write(
     return get(connection, twin, number)
 
 
-def end(connection: Connection, twin: int, number: int, stop_us: int) -> AlarmRow:
-    """End an alarm that lasts."""
-    connection.execute(
-        "UPDATE alarm SET stop_us = CASE WHEN start_us > ? THEN start_us ELSE ? END WHERE id = ?",
-        (stop_us, stop_us, number),
-    )
+def change(connection: Connection, twin: int, number: int, start_us: int, stop_us: int | None, body: Json) -> AlarmRow:
+    """Write down what is known of an alarm by now, and return it."""
+    query = "UPDATE alarm SET start_us = ?, stop_us = ?, body = ? WHERE id = ?"
+    connection.execute(query, (start_us, stop_us, orjson.dumps(body).decode(), number))
     return get(connection, twin, number)
+
+
+def end(connection: Connection, twin: int, number: int, stop_us: int, why: str | None = None) -> AlarmRow:
+    """End an alarm that lasts; ``why``, where it is not that readings came back, is added to what it says."""
+    row = get(connection, twin, number)
+    body = row.body if why is None else row.body | {"message": f"{row.body['message']}; {why}"}
+    return change(connection, twin, number, row.start_us, max(row.start_us, stop_us), body)
+
+
+def remove(connection: Connection, twin: int, number: int) -> None:
+    """Forget an alarm."""
+    connection.execute("DELETE FROM alarm WHERE twin = ? AND id = ?", (twin, number))
 
 
 def get(connection: Connection, twin: int, number: int) -> AlarmRow:
@@ -134,6 +145,17 @@ def lasting(connection: Connection, twin: int) -> list[AlarmRow]:
     """Return the alarms that last."""
     query = _SELECT + "WHERE twin = ? AND stop_us IS NULL ORDER BY id"
     return [_row(row) for row in connection.execute(query, (twin,))]
+
+
+def between(connection: Connection, twin: int, limit: Limit, first_us: int, last_us: int) -> list[AlarmRow]:
+    """Return the alarms of a limit that lasted at any time from one instant to another, in their order."""
+    query = (
+        _SELECT
+        + """WHERE twin = ? AND origin = ? AND channel = ? AND colour = ? AND side = ? AND bound = ?
+             AND start_us <= ? AND (stop_us IS NULL OR stop_us >= ?) ORDER BY start_us, id"""
+    )
+    place = (limit.origin, limit.channel, limit.colour, limit.side, limit.bound)
+    return [_row(row) for row in connection.execute(query, (twin, *place, last_us, first_us))]
 
 
 def select(connection: Connection, twin: int, most: int) -> list[AlarmRow]:
@@ -176,3 +198,11 @@ def watch(connection: Connection, twin: int, seq: int, state: Json) -> None:
     query = """INSERT INTO watched (twin, seq, state) VALUES (?, ?, ?)
                ON CONFLICT (twin) DO UPDATE SET seq = excluded.seq, state = excluded.state"""
     connection.execute(query, (twin, seq, orjson.dumps(state).decode()))
+
+
+def taken(connection: Connection, twin: int, start_us: int, stop_us: int) -> None:
+    """Note that samples were taken out of the archive: the next look asks which alarms still stand, and tells nothing again."""
+    seq, state = watched(connection, twin)
+    if seq >= 0:
+        before = state.get("taken", [start_us, stop_us])
+        watch(connection, twin, seq, state | {"taken": [min(start_us, before[0]), max(stop_us, before[1])]})

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from service.store import residuals, segments
+from service.store import alarms, residuals, segments
 from service.store.batch import Batch
 from service.store.connection import Connection
 from service.store.segments import WITHIN, within
@@ -67,9 +67,7 @@ def _forget(connection: Connection, twin: int, start_us: int, stop_us: int) -> N
     connection.execute("DELETE FROM checkpoint WHERE twin = ? AND time_us >= ?", (twin, start_us))
     query = "DELETE FROM anomaly WHERE twin = ? AND start_us >= ? AND start_us < ?"
     connection.execute(query, (twin, start_us, stop_us))
-    query = "DELETE FROM alarm WHERE twin = ? AND origin = 'measured' AND start_us >= ? AND start_us < ?"
-    connection.execute(query, (twin, start_us, stop_us))
-    connection.execute("DELETE FROM watched WHERE twin = ?", (twin,))
+    alarms.taken(connection, twin, start_us, stop_us)
     query = """SELECT DISTINCT version, coalesce(n_rows, length(value) / (8 * n)) FROM residual
                WHERE twin = ? AND last_us >= ? AND first_us < ?"""
     for version, n_rows in connection.execute(query, (twin, start_us, stop_us)).fetchall():

@@ -97,6 +97,14 @@ def latest_seq(connection: Connection, twin: int) -> int:
     return int(row[0])
 
 
+def last_us(connection: Connection, twin: int) -> int | None:
+    """Return the last instant of the archive; None while it is empty."""
+    row = connection.execute("SELECT last_us FROM head WHERE twin = ?", (twin,)).fetchone()
+    if row is None:
+        raise TwinGone(f"twin {twin} is gone")
+    return None if row[0] is None else int(row[0])
+
+
 def revision(connection: Connection, twin: int) -> int:
     """Return how often stored samples of a twin were taken away."""
     row = connection.execute("SELECT revision FROM head WHERE twin = ?", (twin,)).fetchone()

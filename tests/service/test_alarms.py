@@ -2,12 +2,16 @@
 
 import copy
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from service.store import alarms as store
+from service.store import samples
+from service.store.connection import Connection
 from service.workbench.interface import Forecasted, ForecastTask
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
@@ -98,13 +102,81 @@ def test_each_side_and_each_kind_of_channel(client: AppClient) -> None:
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 2.0' in text
 
 
-def test_markers_of_missing_samples_and_late_samples_raise_nothing(client: AppClient) -> None:
+def test_markers_of_missing_samples_raise_nothing(client: AppClient) -> None:
     send(client, [0, 1, 2, 3], [290.0, -999.0, -999.0, 290.0], T_tank=[41.0] * 4)
     alarms(client, 1, channel="T_tank")
-    send(client, [0.2, 0.4], [320.0, 320.0])  # of the past
     send(client, [10, 11], [290.0, 290.0], T_tank=[41.0] * 2, Q_px=[150.0, 150.0])
     alarms(client, 1, channel="Q_px")
     assert {row["channel"] for row in alarms(client, 2)} == {"T_tank", "Q_px"}
+
+
+def send_one(client: AppClient, channel: str, times: list[float], values: list[float]) -> None:
+    """Send one channel by itself, and wait until it was looked at."""
+    body = {"time": times, "values": {channel: values}}
+    assert client.post(f"{TWIN}/telemetry", json=body).status_code == 200
+    until(lambda: read(client, lambda connection, twin: not unseen(connection, twin)))
+
+
+def read(client: AppClient, question: Callable[[Connection, int], Any]) -> Any:
+    """Return what the database answers about the twin."""
+    service = client.app.state.service
+    return client.portal.call(lambda: service.database.read(question, service.registry.get("benchsat").key))
+
+
+def unseen(connection: Connection, twin: int) -> int:
+    """Return how many samples nobody has looked at."""
+    seq, _ = store.watched(connection, twin)
+    return int(samples.since_seq(connection, twin, len(LIMITED["channels"]), seq)[0].size)
+
+
+def told(client: AppClient) -> list[tuple[str, str, bool]]:
+    """Return what the stream said of alarms: channel, colour, whether it lasts."""
+    found = [m["alarm"] for m in messages(client) if m["type"] == "alarm"]
+    return [(row["channel"], row["colour"], row["stop"] is None) for row in found]
+
+
+@pytest.mark.parametrize("ahead_s", [0.0, 60.0])
+def test_a_channel_that_never_arrives_first_is_judged_by_itself(client: AppClient, ahead_s: float) -> None:
+    for k in range(4):
+        send_one(client, "Q_px", [k + ahead_s], [0.5])
+        send_one(client, "T_px", [float(k)], [305.0])
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:00Z", None)
+
+
+def test_a_recorder_dump_raises_an_alarm_that_is_over(client: AppClient) -> None:
+    send_one(client, "T_px", [100.0, 101.0, 102.0], [290.0] * 3)
+    send_one(client, "T_px", [10.0 + k for k in range(50)], [305.0] * 50)
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:10Z", "1970-01-01T00:01:40Z")
+    assert alarm["message"] == "T_px was above its yellow limit of 300 K: 305 at worst"
+    send_one(client, "T_px", [5.0, 6.0, 70.0], [305.0] * 3)  # the same alarm, known better
+    (alarm,) = alarms(client, 1)
+    assert alarm["start"] == "1970-01-01T00:00:05Z"
+    send_one(client, "T_px", [103.0, 104.0], [305.0] * 2)
+    alarms(client, 2)
+    assert told(client) == [("T_px", "yellow", False), ("T_px", "yellow", True)]
+
+
+def test_one_reading_ahead_of_the_others_hides_nothing(client: AppClient) -> None:
+    send_one(client, "T_px", [290.0], [290.0])
+    for k in range(5):  # one by one: each is looked at beside the one before
+        send_one(client, "T_px", [float(k)], [305.0])
+    (alarm,) = alarms(client, 1)
+    assert (alarm["start"], alarm["stop"]) == ("1970-01-01T00:00:00Z", None)
+    send_one(client, "T_px", [291.0], [290.0])
+    alarms(client, 1, stop="1970-01-01T00:04:50Z")
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
+
+
+def test_late_readings_neither_end_nor_repeat_an_alarm_that_lasts(client: AppClient) -> None:
+    send_one(client, "T_px", [100.0, 101.0, 110.0, 111.0], [305.0] * 4)
+    send_one(client, "T_px", [104.0, 105.0], [290.0] * 2)
+    send_one(client, "T_px", [50.0, 51.0, 52.0, 53.0], [305.0, 305.0, 290.0, 290.0])
+    now, before = alarms(client, 2)
+    assert (now["start"], now["stop"]) == ("1970-01-01T00:01:40Z", None)
+    assert (before["start"], before["stop"]) == ("1970-01-01T00:00:50Z", "1970-01-01T00:00:52Z")
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
 
 
 def test_an_alarm_survives_a_restart_as_one(make_client) -> None:
@@ -140,6 +212,41 @@ def test_acknowledging_and_shelving(client: AppClient) -> None:
     taken_up = client.post(f"{TWIN}/alarms/{new['id']}/shelve", json={"for_s": 0}).json()
     assert taken_up["shelved_until"] is None
     assert 'twin_open_alarms{colour="red",twin="benchsat"} 1.0' in client.get("/metrics").text
+
+
+@pytest.mark.parametrize("is_taken_up", [True, False])
+def test_an_alarm_that_began_while_shelved_is_told_once_it_is_not(client: AppClient, is_taken_up: bool) -> None:
+    send(client, [0, 1, 2, 3], [301.0, 301.0, 290.0, 290.0])
+    (alarm,) = alarms(client, 1)
+    shelve_s = 3600.0 if is_taken_up else 2.0
+    path = f"{TWIN}/alarms/{alarm['id']}/shelve"
+    assert client.post(path, json={"for_s": shelve_s}).status_code == 200
+    send_one(client, "T_px", [4.0, 5.0], [301.0, 301.0])
+    before = [("T_px", "yellow", False)]
+    assert told(client) == before
+    if is_taken_up:
+        client.post(path, json={"for_s": 0})
+    until(lambda: told(client) == [*before, ("T_px", "yellow", True)])
+    send_one(client, "T_px", [6.0, 7.0, 8.0], [301.0, 290.0, 290.0])
+    alarms(client, 0, stop=None)
+    assert told(client) == [*before, ("T_px", "yellow", True), ("T_px", "yellow", False)]
+
+
+@pytest.mark.parametrize(
+    ("limits", "why"), [({"red": [None, 500.0]}, "removed"), (None, "removed"), ({"yellow": [None, 302.0]}, "changed")]
+)
+def test_a_limit_that_is_removed_ends_its_alarm(client: AppClient, limits: dict | None, why: str) -> None:
+    send(client, [0, 1], [303.0, 303.0])
+    alarms(client, 1, stop=None)
+    revised = copy.deepcopy(SPEC)
+    if limits is not None:
+        revised["channels"]["T_px"]["limits"] = limits
+    assert client.request("PUT", TWIN, json=revised).status_code == 200
+    (ended,) = alarms(client, 1, stop="1970-01-01T00:00:01Z")
+    assert ended["message"] == f"T_px was above its yellow limit of 300 K: 303 at worst; the limit was {why}"
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
+    send(client, [2, 3], [303.0, 303.0])
+    alarms(client, int(why == "changed"), stop=None)
 
 
 def calibrate(client: AppClient) -> None:
@@ -204,14 +311,58 @@ def test_a_forecast_alarm_gives_way_to_the_measured_one(client: AppClient, monke
     alarms(client, 1, on="forecast", colour="red", stop=None)
 
 
+def take_away(client: AppClient, start: float, stop: float, **more: str) -> None:
+    """Delete samples, and wait until that was looked at."""
+    params = {"start": start, "stop": stop, **more}
+    assert client.request("DELETE", f"{TWIN}/telemetry", params=params).status_code == 200
+    until(lambda: "taken" not in read(client, store.watched)[1])
+
+
 def test_a_deletion_takes_its_alarms_along(client: AppClient) -> None:
-    send(client, [0, 1, 2, 3], [290.0, 340.0, 340.0, 290.0])
-    alarms(client, 2)
-    client.request("DELETE", f"{TWIN}/telemetry", params={"start": 1, "stop": 3})
-    alarms(client, 0)
-    send(client, [4, 5], [301.0, 301.0])
-    (left,) = alarms(client, 1)
-    assert left["start"] == "1970-01-01T00:00:04Z"
+    send(client, [0, 1, 2, 3, 4, 5, 6], [290.0, 305.0, 305.0, 290.0, 290.0, 340.0, 340.0])
+    alarms(client, 3)
+    take_away(client, 1, 3)
+    alarms(client, 2, stop=None)
+    take_away(client, 5, 7)
+    assert [row["start"] for row in alarms(client, 2)] == ["1970-01-01T00:00:05Z"] * 2
+    (ended,) = alarms(client, 1, stop="1970-01-01T00:00:05Z", colour="yellow")
+    assert ended["message"].endswith("340 at worst; its readings were taken away")
+    assert len(told(client)) == 5  # three began, of which one was over at once, and two ended
+    send(client, [5, 6], [301.0, 301.0])
+    (left,) = alarms(client, 1, stop=None)
+    assert left["start"] == "1970-01-01T00:00:05Z"
+
+
+def test_a_deletion_repeats_nothing_and_leaves_one_alarm(client: AppClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    send_one(client, "T_px", [0.0, 1.0, 2.0, 3.0], [305.0, 305.0, 290.0, 290.0])
+    send_one(client, "T_px", [float(k) for k in range(10, 20)], [303.0, 303.0, 308.0] + [304.0] * 7)
+    monkeypatch.setattr("service.live.judging.MOST_PAST", 3)
+    before = told(client)
+    assert before == [("T_px", "yellow", False), ("T_px", "yellow", True)]
+    take_away(client, 12, 13)  # the worst of the alarm that lasts
+    take_away(client, 1, 2)
+    take_away(client, 0, 1, channels="Q_px")
+    past, now = sorted(alarms(client, 2), key=lambda row: row["start"])
+    assert (past["start"], past["stop"]) == ("1970-01-01T00:00:00Z", "1970-01-01T00:00:02Z")
+    assert (now["start"], now["stop"]) == ("1970-01-01T00:00:10Z", None)
+    assert told(client) == before
+    take_away(client, 10, 12)
+    alarms(client, 1, stop=None)
+    send_one(client, "T_px", [20.0, 21.0], [290.0, 290.0])
+    alarms(client, 0, stop=None)
+    assert told(client) == [*before, ("T_px", "yellow", False)]
+
+
+def test_what_a_deletion_leaves_of_an_alarm(client: AppClient) -> None:
+    send_one(client, "T_px", [0.0, 1.0, 2.0, 3.0, 4.0], [309.0, 309.0, 303.0, 303.0, 303.0])
+    take_away(client, 0, 2)
+    (alarm,) = alarms(client, 1, stop=None)
+    assert (alarm["start"], alarm["worst"]) == ("1970-01-01T00:00:02Z", 303.0)
+    take_away(client, 3, 5)
+    alarms(client, 1, stop=None, worst=303.0)
+    take_away(client, 2, 3)
+    alarms(client, 0, stop=None)
+    assert told(client) == [("T_px", "yellow", True), ("T_px", "yellow", False)]
 
 
 WRONG = (

@@ -35,4 +35,6 @@ async def acknowledge(
 async def shelve(service: Running, twin: NamedTwin, alarm: Number, request: ShelveRequest) -> Alarm:
     """Hear nothing of the limit of an alarm for a while, whatever happens at it; other limits are watched as ever."""
     until_us = now_us() + round(request.for_s * 1e6) if request.for_s else None
-    return Alarm(**(await service.database.write_to(twin.key, alarms.shelve, twin.key, alarm, until_us)).wire())
+    row = await service.database.write_to(twin.key, alarms.shelve, twin.key, alarm, until_us)
+    service.live.shelved(twin)
+    return Alarm(**row.wire())
