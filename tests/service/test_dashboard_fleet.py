@@ -32,10 +32,16 @@ def fill(connection: Connection, at_us: int) -> None:
     generator = np.random.default_rng(0)
     for k in range(COUNT):
         family = f"block-{1 + k // 250}"
-        twin, _ = twins.register(connection, f"sat-{k:04}", {**SPEC, "twin": f"sat-{k:04}", "family": family})
+        limits = {"red": [None, 295.0]} if k % 125 == 60 else {"yellow": [None, 296.0]} if k % 50 == 33 else None
+        watched = {"T_px": {**SPEC["channels"]["T_px"], "limits": limits}} if limits else {}
+        declared = {**SPEC, "twin": f"sat-{k:04}", "family": family, "channels": {**SPEC["channels"], **watched}}
+        twin, _ = twins.register(connection, f"sat-{k:04}", declared)
         ages_us = 30_000_000 * np.arange(40, 0, -1) + (3_600_000_000 if k % 100 == 7 else 0)
         time_us = (at_us - ages_us).astype(np.int64)
-        appending.append(connection, twin.key, Batch(time_us, generator.normal(290, 1, (3, 40)), time_us + 1_000_000))
+        values = generator.normal(290, 1, (3, 40))
+        if k % 125 == 60:
+            values[0, -5:] = 297.0
+        appending.append(connection, twin.key, Batch(time_us, values, time_us + 1_000_000))
         if k % 200 == 11:
             continue
         summary = {"epoch_us": at_us, "train": {}, "validation": {"rmse_K": 0.1}, "effects": []}
@@ -52,7 +58,7 @@ def fill(connection: Connection, at_us: int) -> None:
         if k % 50 == 33:
             expected = format_instant(at_us + int((1 + k / 100) * 3.6e9))
             body = {"unit": "K", "message": "T_px reaches its yellow limit", "expected": expected}
-            alarms.write(connection, twin.key, Limit("forecast", "T_px", "yellow", "high", 293.0), at_us, None, body)
+            alarms.write(connection, twin.key, Limit("forecast", "T_px", "yellow", "high", 296.0), at_us, None, body)
         if k % 40 == 21:
             anomalies.apply(connection, twin.key, 1, [Change("T_px", "bias", at_us, None, 5.0)], (at_us - 1, at_us))
 
