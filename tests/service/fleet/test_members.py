@@ -169,17 +169,23 @@ def activate(client: AppClient) -> None:
     assert client.post(f"{TWIN}/models/1/activate").status_code == 200
 
 
-def test_an_owner_that_knew_of_a_twin_before_it_heard_of_it_hears_of_its_model(
-    pair: tuple[AppClient, AppClient], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A request has let it begin to follow the twin; the first word that it hears of it tells of a model that came since."""
-    applied, may_hear = Member._apply, threading.Event()
+@pytest.fixture
+def may_hear(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """Members hear of what others change only while it is set."""
+    applied, event = Member._apply, threading.Event()
 
     async def apply(self: Member, one: Changed) -> None:
-        if may_hear.is_set():
+        if event.is_set():
             await applied(self, one)
 
     monkeypatch.setattr(Member, "_apply", apply)
+    return event
+
+
+def test_an_owner_that_knew_of_a_twin_before_it_heard_of_it_hears_of_its_model(
+    pair: tuple[AppClient, AppClient], may_hear: threading.Event
+) -> None:
+    """A request has let it begin to follow the twin; the first word that it hears of it tells of a model that came since."""
     pair[0].post("/v1/twins", json=SPEC)
     feed(pair[0], 0)
     assert [c.get(TWIN).status_code for c in pair] == [200, 200]
@@ -193,17 +199,10 @@ def test_an_owner_that_knew_of_a_twin_before_it_heard_of_it_hears_of_its_model(
 
 
 def test_an_owner_that_tells_something_itself_still_hears_of_samples(
-    pair: tuple[AppClient, AppClient], monkeypatch: pytest.MonkeyPatch
+    pair: tuple[AppClient, AppClient], may_hear: threading.Event
 ) -> None:
     """Its own message has the last number when it hears of samples that another process stored just before."""
-    applied, may_hear = Member._apply, threading.Event()
-
-    async def apply(self: Member, one: Changed) -> None:
-        if may_hear.is_set():
-            await applied(self, one)
-
     may_hear.set()
-    monkeypatch.setattr(Member, "_apply", apply)
     pair[0].post("/v1/twins", json=SPEC)
     feed(pair[0], 0)
     activate(pair[0])
