@@ -84,13 +84,18 @@ def test_a_restart_forgets_nothing_of_it(make_client, clock: list[float]) -> Non
     )
 
 
+def calibrate(client: AppClient) -> None:
+    """Let a first model be active."""
+    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
+    while client.get(path).json()["state"] in ("queued", "running"):
+        time.sleep(0.02)
+
+
 def test_a_forecast_says_that_telemetry_stopped(make_client, clock: list[float]) -> None:
     client = make(make_client)
     begin = clock[0] - 100.0
     send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
-    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
-    while client.get(path).json()["state"] in ("queued", "running"):
-        time.sleep(0.02)
+    calibrate(client)
     fresh = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()
     assert fresh["notices"] == ["held the last readings"]
     clock[0] += 10_000.0
@@ -139,9 +144,7 @@ def test_a_forecast_says_that_it_begins_ahead_of_the_clock(make_client, clock: l
 
     begin = clock[0]
     frames(begin - 99.0, 100)
-    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
-    while client.get(path).json()["state"] in ("queued", "running"):
-        time.sleep(0.02)
+    calibrate(client)
     clock[0] = begin - 1.5
     assert told() == []
     clock[0] = begin
@@ -162,9 +165,7 @@ def test_a_forecast_names_the_sensors_that_arrive_late_while_others_do_not(make_
     begin = clock[0] - 7300.0
     send(client, [begin + k for k in range(100)], T_tank=[15.0] * 100, Q_px=[0.5] * 100)
     send(client, [clock[0] - k for k in range(100)], T_px=[290.0] * 100, Q_px=[0.5] * 100)
-    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
-    while client.get(path).json()["state"] in ("queued", "running"):
-        time.sleep(0.02)
+    calibrate(client)
     notices = client.get(f"{TWIN}/forecast", params={"horizon_s": 60}).json()["notices"]
     assert "telemetry of T_tank arrives 2 h late" in notices and states(client)["T_tank"] == "delayed"
 
@@ -173,9 +174,7 @@ def test_a_forecast_says_of_which_inputs_nothing_comes_any_more(make_client, clo
     client = make(make_client)
     begin = clock[0] - 100.0
     send(client, [begin + k for k in range(100)], T_px=[290.0] * 100, T_tank=[15.0] * 100, Q_px=[0.5] * 100)
-    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
-    while client.get(path).json()["state"] in ("queued", "running"):
-        time.sleep(0.02)
+    calibrate(client)
     ahead = {"horizon_s": 60.0, "step_s": 60.0}
     told = []
     for silent_s in (30.0, 10_800.0):
@@ -202,9 +201,7 @@ def test_readings_that_repeat_are_a_sign(make_client) -> None:
         T_tank=[15.0 + 0.25 * (k * 3 % 7) for k in range(200)],
         Q_px=[0.5] * 200,
     )
-    path = client.post(f"{TWIN}/calibrations", json={"activate": True}).headers["location"]
-    while client.get(path).json()["state"] in ("queued", "running"):
-        time.sleep(0.02)
+    calibrate(client)
     send(client, [200.0 + k for k in range(60)], T_px=[290.0] * 60, T_tank=[None] * 60)
     client.get(f"{TWIN}/residuals")
     found = channels(client)

@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
-from twin_core.effects.straight_line import range_of_slope, slope_quality
+from twin_core.effects.straight_line import range_of_slope, slope_spec
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Capacity, Entry
 from twin_core.parameters.parameter import Parameter
@@ -63,7 +63,7 @@ class CapacityTemperature(Effect):
 
     def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the relative change of capacity per kelvin."""
-        return (slope_quality("kappa_per_K", self.settings),)
+        return (slope_spec("kappa_per_K", self.settings),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of capacity."""

@@ -10,7 +10,7 @@ from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.declared import conductor_places, declared_conductor
 from twin_core.effects.missing_conductor import PairConductor
-from twin_core.effects.straight_line import range_of_slope, slope_quality
+from twin_core.effects.straight_line import range_of_slope, slope_spec
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, BoundaryConductor, Entry, Heat, pair_jacobian
 from twin_core.parameters.parameter import Parameter
@@ -70,7 +70,7 @@ class ConductanceTemperature(Effect):
 
     def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return the temperature coefficient."""
-        return (slope_quality("beta_per_K", self.settings),)
+        return (slope_spec("beta_per_K", self.settings),)
 
     def addition(self, layout: Layout) -> Addition:
         """Return the change of the declared conductor."""

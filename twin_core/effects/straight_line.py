@@ -27,7 +27,7 @@ def range_of_slope(temperature_K: FloatArray, reference_K: float, least_share: f
     return bounds | ({"most_per_K": most / below} if below > 0.0 else {})
 
 
-def slope_quality(name: str, settings: Mapping[str, Any]) -> ParameterSpec:
+def slope_spec(name: str, settings: Mapping[str, Any]) -> ParameterSpec:
     """Return the slope of a straight line as a parameter, within its range where a training record tells one."""
     lower, upper = settings.get("least_per_K"), settings.get("most_per_K")
     return ParameterSpec(name, "1/K", null=0.0, lower=lower, upper=upper, breaks_down=True)

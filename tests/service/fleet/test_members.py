@@ -216,9 +216,8 @@ def test_an_owner_that_tells_something_itself_still_hears_of_samples(
     owner.portal.call(hub.write, 1, outcome.tell, 1, [("stale", {"state": "live", "channels": [], "text": "heard"})])
     may_hear.set()
     tracker = owner.app.state.service.live.find(1)
-    until(
-        lambda: tracker.position is not None and tracker.position.n_samples == 70
-    )  # nobody asks, which would let it look
+    # nobody asks, which would let it look
+    assert until(lambda: tracker.position is not None and tracker.position.n_samples == 70)
 
 
 def follows(client: AppClient) -> bool:
