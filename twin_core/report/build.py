@@ -20,8 +20,8 @@ from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
 
 WORSE_THERE = 3.0
-"""A ratio of errors (rms), which decides about a notice only: a misfit of two noises makes it 2.2 by itself. Of 32 measured splits
-it tells of 10 (another room, runs of other kinds than those searched), half of it would tell of 24, twice of 6."""
+"""A ratio of errors (rms), which decides about a notice only: a misfit of two noises makes it 2.2 by itself. Of 32 measured
+splits it tells of 10 (another room, runs of other kinds than those searched), half of it would tell of 24, twice of 6."""
 MOST_REJECTED = 8
 """Rows of what was tried and not supported."""
 
@@ -156,8 +156,8 @@ def _differs_there(score: Json, training_K: float) -> list[str]:
         return []
     return [
         f"the part that was kept back fits {held_K / training_K:.0f} times worse than what was searched ({held_K:.3g} K against "
-        f"{training_K:.3g} K): it differs in something that no search was shown; if the spacecraft may have changed, let the search "
-        "see some of it (a smaller holdout)"
+        f"{training_K:.3g} K): it differs in something that no search was shown; if the spacecraft may have changed, let the "
+        "search see some of it (a smaller holdout)"
     ]
 
 
