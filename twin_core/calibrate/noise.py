@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.special import ndtr
 
 from twin_core._typing import FloatArray
 from twin_core.network.spec import TwinSpec
@@ -19,12 +20,19 @@ UNEVEN = 0.05
 UNEVEN_ORDER = 4
 """Order of the divided differences there: their points lie further apart, where a curve of second order is no longer one."""
 
+WINSORISED = 2.0
+"""Differences of quantised readings, in units of their own scale, beyond which they count no more: an event in one of ten raises
+the scale by a quarter."""
+SETTLED, MOST_ROUNDS = 1e-4, 100
+"""Relative change of that scale at which it has settled, and rounds at most."""
 
-def difference_noise_K(time_s: FloatArray, column: FloatArray) -> float:
-    """Return the white-noise standard deviation of readings (n_times,), robust against steps; NaN if too short.
+
+def difference_noise_K(time_s: FloatArray, column: FloatArray, quantum_K: float = 0.0) -> float:
+    """Return the white-noise standard deviation of readings (n_times,), robust against events; NaN if too short.
 
     From second differences; where the sampling is uneven from divided differences, since a steady slope leaves nothing of
-    these, whatever the intervals. A difference that touches a missing reading is left out.
+    these, whatever the intervals. A difference that touches a missing reading is left out. The median of differences that are
+    multiples of ``quantum_K`` is such a multiple itself, whatever the noise: there a winsorised mean square tells.
     """
     steps_s = np.diff(time_s)
     if not steps_s.size or np.mean(np.abs(steps_s / np.median(steps_s) - 1.0) > UNEVEN) <= UNEVEN:
@@ -34,7 +42,22 @@ def difference_noise_K(time_s: FloatArray, column: FloatArray) -> float:
     seen = differences[np.isfinite(differences)]
     if seen.size < 8:
         return float("nan")
+    if quantum_K > 0.0:
+        return _winsorised_std(seen)
     return float(np.median(np.abs(seen - np.median(seen)))) / 0.6745
+
+
+def _winsorised_std(values: FloatArray) -> float:
+    """Return the standard deviation of normal values with outliers among them (Huber 1981, Robust Statistics, proposal 2)."""
+    most = WINSORISED
+    density = np.exp(-0.5 * most**2) / np.sqrt(2.0 * np.pi)
+    consistent = 2.0 * ndtr(most) - 1.0 - 2.0 * most * density + 2.0 * most**2 * ndtr(-most)
+    std = float(np.sqrt(np.mean(values**2)))
+    for _ in range(MOST_ROUNDS):
+        before, std = std, float(np.sqrt(np.mean(np.minimum(values**2, (most * std) ** 2)) / consistent))
+        if abs(std - before) <= SETTLED * before:
+            break
+    return std
 
 
 def _divided_differences(time_s: FloatArray, column: FloatArray) -> FloatArray:
@@ -71,13 +94,14 @@ def sensor_noise_K(spec: TwinSpec, records: list[Record]) -> FloatArray:
     stds = []
     for sensor in spec.sensors:
         columns = [(r.time_s, r.values[sensor]) for r in records if sensor in r.values]
-        counting = max((quantum(c) for _, c in columns), default=0.0) / np.sqrt(12.0)
+        quanta = [quantum(c) for _, c in columns]
+        counting = max(quanta, default=0.0) / np.sqrt(12.0)
         declared = spec.noise_std_K(sensor)
         if declared is not None:  # what the readings show contains their quantisation wherever they move, this does not
             std = float(np.hypot(declared, counting))
         else:
             std = (
-                max(_median(difference_noise_K(t, c) for t, c in columns), counting)
+                max(_median(difference_noise_K(t, c, q) for (t, c), q in zip(columns, quanta, strict=True)), counting)
                 or _median(_noise_of_changes_K(t, c) for t, c in columns)
                 or min((step for _, c in columns if (step := resolution(c)) > 0.0), default=0.0) / np.sqrt(12.0)
                 or FALLBACK_STD_K

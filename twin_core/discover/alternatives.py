@@ -7,13 +7,24 @@ itself hardly tells from the best one.
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
+from twin_core.calibrate.second_order import Calibration
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance
-from twin_core.discover.confirm import Trial, about_trajectory, mean_excess, try_on_trajectories, weigh
+from twin_core.discover.confirm import (
+    Trial,
+    about_trajectory,
+    mean_excess,
+    shared_unknowns,
+    try_on_trajectories,
+    weigh,
+)
 from twin_core.discover.judge import Finding, Judged, Search, worth
-from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, screened
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
 from twin_core.effects.base import Effect
 
 N_COMPARED = 8
@@ -40,8 +51,8 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         return finding
     least = (1.0 - policy.REPEATABLE_SHARE) * (mean_excess(simple) - left)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
-    calibration = simple.calibration()
-    about = about_trajectory(calibration.problem, calibration.optimum)
+    bare = _bare(simple, state.trial.calibration())
+    about = about_trajectory(bare.problem, bare.optimum)
     probes = best_of_each_place(
         screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
     )
@@ -50,17 +61,33 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= near]
 
     def compared(effect: Effect) -> Judged | None:
-        work = partial(_explaining, state, simple, effect, least, needed)
+        work = partial(_explaining, state, simple, bare, effect, least, needed)
         return state.attempt(work, f"{effect.label} instead of {own.label}")
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        told = [j for j in pool.map(compared, others[:N_COMPARED]) if j is not None]
+        told = [j for j in pool.map(compared, refined(about, others[:N_COMPARED])) if j is not None]
     return Finding(finding.judged, (*finding.alternatives, *sorted(told, key=worth)))
 
 
-def _explaining(state: Search, simple: Trial, effect: Effect, least: float, needed: float) -> Judged | None:
+def _bare(simple: Trial, found: Calibration) -> Calibration:
+    """Return the model without a finding at the parameters that it has with it: all that is missing there is what was found.
+
+    Fitted without it, parameters make up for it as well as they can, and far from there nothing answers linearly. Where that
+    model has no solution, it is taken as it was fitted.
+    """
+    problem = simple.fit.problem
+    unknowns = found.optimum.unknowns[shared_unknowns(found, problem)]
+    fit = problem.solve(unknowns)
+    if not np.isfinite(fit.cost):
+        return simple.calibration()
+    return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
+
+
+def _explaining(
+    state: Search, simple: Trial, bare: Calibration, effect: Effect, least: float, needed: float
+) -> Judged | None:
     """Return an effect on top of a trial if it is supported and explains at least so much of the misfit."""
-    trial = try_on_trajectories(simple, (*simple.present_effects, effect))
+    trial = try_on_trajectories(simple, (*simple.present_effects, effect), bare)
     if trial is None or mean_excess(simple) - mean_excess(trial) < least:
         return None
     own = tuple(e for e in trial.effects if e.place == effect.place)

@@ -212,14 +212,15 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 
-def try_on_trajectories(base: Trial, effects: Sequence[Effect]) -> Trial | None:
+def try_on_trajectories(base: Trial, effects: Sequence[Effect], start: Calibration | None = None) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
-    None where the balance has no solution there. The undeclared heat is sized about the result, for a later look.
+    Or from another ``start`` of the simpler problem. None where the balance has no solution there. The undeclared heat is
+    sized about the result, for a later look.
     """
     problem = extended(base.fit.problem, effects)
     own = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(base.calibration(), problem, own))
+    optimum = minimise(problem, carried_over(start or base.calibration(), problem, own))
     if optimum.status == "no_solution":
         return None
     fit = about_trajectory(problem, optimum)

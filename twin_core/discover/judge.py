@@ -87,7 +87,10 @@ class Finding:
             return self
         rest = self.judged.evidence.log_bayes_factor - worth_of_it
         evidence = replace(self.judged.evidence, log_bayes_factor=rest)
-        return replace(self, judged=replace(self.judged, effects=kept, evidence=evidence, trial=trial))
+        others = tuple(
+            j for j in self.alternatives if len(j.effects) <= len(kept)
+        )  # a larger set names what was withdrawn
+        return Finding(replace(self.judged, effects=kept, evidence=evidence, trial=trial), others)
 
 
 @dataclass
@@ -112,6 +115,8 @@ class Search:
         Of how many samples of the training record the search looked at one.
     first
         Places of effects that spacecraft of the same design have: they are tried wherever they could matter.
+    past
+        Trials from which the search went on, each with what had been found by then.
     without
         The trial so far, and by places what it is without the effects there, as far as anybody has asked.
     """
@@ -126,6 +131,7 @@ class Search:
     left_out: list[str] = field(default_factory=list)
     every: int = 1
     first: Collection[Place] = ()
+    past: tuple[Trial, ...] = ()
     without: tuple[Trial, dict[frozenset[object], "Without | None"]] | None = None
 
     @contextmanager

@@ -26,7 +26,7 @@ from twin_core.discover.judge import (
     foresight_of,
     worth,
 )
-from twin_core.effects.base import touched_nodes
+from twin_core.effects.base import Effect, touched_nodes
 
 N_EXCHANGED = 2
 """Refused options that are tried in the place of a finding."""
@@ -292,13 +292,33 @@ def _attempted_without(state: Search, places: Collection[object]) -> Without | N
     known = state.without[1]
 
     def weighed() -> Without:
-        others = [effect for effect in state.trial.effects if effect.place not in gone]
-        without = try_effects(state.trial, others, n_passes=10) if others else state.base
+        without = _refitted([effect for effect in state.trial.effects if effect.place not in gone], state)
         return without, weigh(without, state.trial, 1).log_bayes_factor
 
     if gone not in known:
         known[gone] = state.attempt(weighed, "the model without " + " and ".join(str(place) for place in gone))
     return known[gone]
+
+
+def _refitted(effects: Sequence[Effect], state: Search) -> Trial:
+    """Return the likeliest trial of some effects of a search: one it went on from, or a fit from above and one from below.
+
+    What was fitted beside effects that are taken away may be caught far from where it belongs without them.
+    """
+    wanted = _forms(effects)
+    known = {_forms(trial.effects): trial for trial in (state.base, *state.past)}
+    if wanted in known:
+        return known[wanted]
+    below = known[max((forms for forms in known if forms < wanted), key=len)]
+    there = {effect.place for effect in below.effects}
+    more = [effect for effect in effects if effect.place not in there]
+    fits = [try_effects(state.trial, effects, n_passes=10), try_effects(below, (*below.effects, *more), n_passes=10)]
+    return max(fits, key=lambda trial: weigh(state.base, trial, 1).log_bayes_factor)
+
+
+def _forms(effects: Sequence[Effect]) -> frozenset[object]:
+    """Return what effects are and where, and with how many parameters."""
+    return frozenset((effect.place, len(effect.parameter_specs())) for effect in effects)
 
 
 def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[frozenset[object], Without | None]:

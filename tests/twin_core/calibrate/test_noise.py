@@ -79,6 +79,15 @@ def test_quantisation_adds_its_variance_to_a_declared_noise() -> None:
     assert found[2] == pytest.approx(np.sqrt(0.01**2 + 0.5**2 / 12.0))
 
 
+@pytest.mark.statistical
+@pytest.mark.parametrize("steps", [0.3, 1.0, 2.0, 3.0, 4.0])
+def test_noise_below_and_above_the_step_of_a_sensor_is_told(steps: float) -> None:
+    """The variance of the noise and of an even error over one step add up (Bennett 1948), however the two compare."""
+    swing = 290.0 + 1.2 * np.sin(np.arange(RNG_SIZE) / 9.0) + noise(0.1)
+    quantised = steps * 0.1 * np.round(swing / (steps * 0.1))
+    assert readings(quantised) == pytest.approx(0.1 * np.sqrt(1.0 + steps**2 / 12.0), rel=0.1)
+
+
 def test_a_sensor_that_tells_nothing_gets_a_usual_noise() -> None:
     found = sensor_noise_K(SPEC, [record_of(np.arange(4.0), A=290.0, B=290.0)])
     np.testing.assert_array_equal(found, [FALLBACK_STD_K, 0.05, 0.01])

@@ -302,10 +302,34 @@ def test_a_model_without_a_finding_is_fitted_once(monkeypatch: pytest.MonkeyPatc
     prune(state, NEEDED)
     withdraw(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == ["a", "b"]
-    assert sorted(fitted) == [("a",), ("b",)]
+    once = [("a",), ("a",), ("b",), ("b",)]  # from the model with both, and from the one with none
+    assert sorted(fitted) == once
     state.trial = stub(load("a"), load("b"), left=0.6)
     withdraw(state, NEEDED)
-    assert sorted(fitted) == [("a",), ("a",), ("b",), ("b",)]
+    assert sorted(fitted) == sorted(2 * once)
+
+
+def test_without_a_finding_the_search_is_where_it_was_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was fitted beside another effect may be caught far from where it belongs alone: its own fit is kept."""
+
+    def caught(trial: Trial, effects: Sequence[Effect], n_passes: int) -> Trial:
+        return stub(*effects, left=9.0)
+
+    monkeypatch.setattr(revision, "try_effects", caught)
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(50.0, 1.0))
+    before = stub(load("a"), left=1.5)
+    state = Search(stub(load("a"), load("b"), left=0.5), stub(left=18.0), past=(stub(left=18.0), before))
+    state.findings = [Finding(judged("a", 50.0)), Finding(judged("b", 50.0))]
+    withdraw(state, NEEDED)
+    assert state.trial is before and [f.effects[0].where["node"] for f in state.findings] == ["a"]
+
+
+def test_what_was_compared_with_a_set_is_no_alternative_to_what_stays_of_it() -> None:
+    pair, other = judged("a", 50.0), judged("c", 49.0)
+    pair = replace(pair, effects=(load("a"), load("b")))
+    alike = replace(pair, effects=(load("a"), load("d")))
+    left = Finding(pair, (alike, other)).without(load("b").place, 20.0, stub(load("a")))
+    assert [e.where["node"] for e in left.effects] == ["a"] and left.alternatives == (other,)
 
 
 @pytest.mark.parametrize(
