@@ -6,6 +6,7 @@ itself hardly tells from the best one.
 """
 
 import os
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
@@ -23,12 +24,12 @@ from twin_core.discover.confirm import (
     try_on_trajectories,
     weigh,
 )
-from twin_core.discover.judge import Finding, Judged, Search, worth
+from twin_core.discover.judge import Finding, Judged, Search, once_each
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
-from twin_core.effects.base import Effect
+from twin_core.effects.base import Effect, Place
 
 N_COMPARED = 8
-"""Other names, no less simple, that are fitted at most, the best ones by linear screening first."""
+"""Other names, no less simple, that are fitted at most from either start, the best ones by linear screening first."""
 
 
 def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, needed: float) -> Finding:
@@ -51,43 +52,57 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         return finding
     least = (1.0 - policy.REPEATABLE_SHARE) * (mean_excess(simple) - left)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
-    bare = _bare(simple, state.trial.calibration())
-    about = about_trajectory(bare.problem, bare.optimum)
+    starts = [simple.calibration()]
+    bare = state.attempt(
+        partial(_bare, simple, state.trial.calibration()), "the parameters found, without " + own.label
+    )
+    starts += [bare] if bare is not None else []
+
+    def compared(option: tuple[Calibration, Effect]) -> Judged | None:
+        work = partial(_explaining, state, simple, *option, least, needed)
+        return state.attempt(work, f"{option[1].label} instead of {own.label}")
+
+    options = [(start, effect) for start in starts for effect in _near(simple, start, own, known)]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        told = [j for j in pool.map(compared, options) if j is not None]
+    return Finding(finding.judged, (*finding.alternatives, *once_each(told)))
+
+
+def _near(simple: Trial, start: Calibration, own: Effect, known: Collection[Place]) -> list[Effect]:
+    """Return the effects that linear screening about a calibration hardly tells from one that was found, the best first."""
+    about = about_trajectory(start.problem, start.optimum)
     probes = best_of_each_place(
         screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
     )
     gains = {p.effect.place: p.gain for p in probes if len(p.effect.parameter_specs()) <= len(own.parameter_specs())}
     near = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
     others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= near]
-
-    def compared(effect: Effect) -> Judged | None:
-        work = partial(_explaining, state, simple, bare, effect, least, needed)
-        return state.attempt(work, f"{effect.label} instead of {own.label}")
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        told = [j for j in pool.map(compared, refined(about, others[:N_COMPARED])) if j is not None]
-    return Finding(finding.judged, (*finding.alternatives, *sorted(told, key=worth)))
+    return refined(about, others[:N_COMPARED])
 
 
 def _bare(simple: Trial, found: Calibration) -> Calibration:
     """Return the model without a finding at the parameters that it has with it: all that is missing there is what was found.
 
-    Fitted without it, parameters make up for it as well as they can, and far from there nothing answers linearly. Where that
-    model has no solution, it is taken as it was fitted.
+    Fitted without it, parameters make up for it as well as they can, and far from there nothing answers linearly.
+
+    Raises
+    ------
+    ArithmeticError
+        Where it has no solution there.
     """
     problem = simple.fit.problem
     unknowns = found.optimum.unknowns[shared_unknowns(found, problem)]
     fit = problem.solve(unknowns)
     if not np.isfinite(fit.cost):
-        return simple.calibration()
+        raise ArithmeticError("the heat balance has no solution there")
     return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
 
 
 def _explaining(
-    state: Search, simple: Trial, bare: Calibration, effect: Effect, least: float, needed: float
+    state: Search, simple: Trial, start: Calibration, effect: Effect, least: float, needed: float
 ) -> Judged | None:
     """Return an effect on top of a trial if it is supported and explains at least so much of the misfit."""
-    trial = try_on_trajectories(simple, (*simple.present_effects, effect), bare)
+    trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
     if trial is None or mean_excess(simple) - mean_excess(trial) < least:
         return None
     own = tuple(e for e in trial.effects if e.place == effect.place)

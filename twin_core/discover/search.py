@@ -194,9 +194,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bo
         some = {probe.effect.place for ranked in rankings for probe in ranked[:N_FREE_PLACES] if probe.gain > needed}
         chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
     else:
-        chosen = refined(
-            state.trial.fit, shortlist(rankings, needed, N_REFITS, state.trial.fit.network.layout, state.first)
-        )
+        chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS, state.first))
     return _accept_settled(state, [(effect,) for effect in chosen], n_tried, needed), rankings[0]
 
 

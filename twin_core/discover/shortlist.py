@@ -1,7 +1,6 @@
 """The shortlist: every candidate of the registry, screened, and the few that are worth a refit."""
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -9,14 +8,10 @@ from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover.confirm import Trial
 from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect, Place, Survey, touched_nodes
-from twin_core.network.model import Layout
+from twin_core.effects.base import Effect, Place, Survey
 
 UNDECLARED_SHARES = (1.0, 0.1, 0.01)
 """Sizes of the undeclared heat at which candidates are screened, as shares of the fitted one."""
-
-N_ALIKE = 3
-"""Forms of a heat at the same nodes that count towards the length of the shortlist; more are tried where they rank high."""
 
 N_VARIED = 4
 """Places at the head of the shortlist that are tried from more than one start."""
@@ -55,35 +50,25 @@ def screened(
 
 
 def shortlist(
-    rankings: Sequence[Sequence[Probe]],
-    needed: float,
-    n_wanted: int,
-    layout: Layout,
-    first: Collection[Place] = (),
+    rankings: Sequence[Sequence[Probe]], needed: float, n_wanted: int, first: Collection[Place] = ()
 ) -> list[Effect]:
     """Return the effects worth a refit: those of the places ``first``, then the best of every ranking in turn, each place once.
 
-    Of ``n_wanted`` each acts elsewhere than most others: many forms of a heat on one node rank side by side, and would leave no
-    room for what is missing at another one. The first few places are joined by the other settings that the rankings prefer
-    there: a set-point or a time constant is found by a local search, and one start may be caught.
+    The first few places are joined by the other settings that the rankings prefer there: a set-point or a time constant
+    is found by a local search, and one start may be caught.
     """
     chosen: dict[object, Effect] = {}
     for probe in (p for ranked in rankings for p in ranked if p.effect.place in first and p.gain > needed):
         chosen.setdefault(probe.effect.place, probe.effect)
     for rank in range(n_wanted):
         for ranked in rankings:
-            if rank < len(ranked) and ranked[rank].gain > needed and _n_unlike(chosen.values(), layout) < n_wanted:
+            if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:
                 chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
     varied = list(chosen)[:N_VARIED]
     starts = {_start(effect): effect for effect in chosen.values()}
     for probe in (p for ranked in rankings for p in ranked if p.effect.place in varied):
         starts.setdefault(_start(probe.effect), probe.effect)
     return list(starts.values())
-
-
-def _n_unlike(effects: Iterable[Effect], layout: Layout) -> int:
-    """Return how many effects there are, of those that act at the same nodes a few at most."""
-    return sum(min(n, N_ALIKE) for n in Counter(frozenset(touched_nodes(e, layout)) for e in effects).values())
 
 
 def _start(effect: Effect) -> tuple[object, int, tuple[float, ...]]:

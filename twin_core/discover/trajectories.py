@@ -90,7 +90,7 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
         return state.attempt(work, f"{effect.label} on trajectories")
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        judged = list(pool.map(fitted, refined(fit, shortlist(rankings, needed, N_REFITS, fit.network.layout))))
+        judged = list(pool.map(fitted, refined(fit, shortlist(rankings, needed, N_REFITS))))
     return [j for j in judged if j is not None]
 
 
