@@ -354,12 +354,33 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
     ratio = max(float(np.sqrt(after.sum() / max(before.sum(), 1e-300))), where_fitted)
-    forward = float(np.sqrt(rich.forward_error() / max(simple.forward_error(), 1e-300)))
+    forward = _forward_ratio(simple, rich)
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
     return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
+
+
+def _forward_ratio(simple: Trial, rich: Trial) -> float:
+    """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
+
+    An event that comes after the beginning is asked about what follows it: the other parameters of a fit to less would be told
+    by readings that know nothing of it, against those of one that has to make up for it.
+    """
+    known = {effect.place for effect in simple.effects}
+    instants = [
+        float(effect.values[q.name])
+        for effect in rich.present_effects
+        if effect.place not in known
+        for q in effect.parameter_specs()
+        if q.instant is not None
+    ]
+    if not instants:
+        before, after = simple.forward_error(), rich.forward_error()
+    else:
+        before, after = (forward_error(trial.calibration(), max(instants)) for trial in (simple, rich))
+    return float(np.sqrt(after / max(before, 1e-300))) if before > 0.0 else 1.0
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

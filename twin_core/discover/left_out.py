@@ -23,7 +23,8 @@ FORWARD_SHARE = 0.35
 """End of a single segment that is predicted from its beginning."""
 
 OPENING_SHARE = 0.1
-"""First samples of a segment, which tell its initial state, and are left out by no check."""
+"""First samples of a segment, which tell its initial state, and those after an event, which tell its size: left out by no check
+of what follows."""
 
 MOST_FOLDS = 4
 """Groups of segments that are left out in turn."""
@@ -92,20 +93,24 @@ def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
     return float(np.nansum(np.where(out, left, 0.0) ** 2))
 
 
-def forward_error(calibration: Calibration) -> float:
-    """Return the open-loop error over what a refit has not seen; infinite where a refit fails.
+def forward_error(calibration: Calibration, event_s: float = -np.inf) -> float:
+    """Return the open-loop error over what a refit has not seen; infinite where a refit fails, zero where nothing is left.
 
     Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
-    Of a single one the end is predicted by a fit to the beginning.
+    Of a single one the end is predicted by a fit to the beginning, up to a while after ``event_s`` on the clock of
+    ``Record.clock_s``: nothing foretells an event that has not begun.
     """
-    return sum(_predicted(calibration, np.concatenate(fold)) for fold in _folds(calibration.problem.segments))
+    folds = _folds(calibration.problem.segments, event_s)
+    return sum(_predicted(calibration, np.concatenate(fold)) for fold in folds if any(rows.any() for rows in fold))
 
 
-def _folds(segments: Sequence[Segment]) -> list[list[BoolArray]]:
+def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]:
     """Return what is left out in turn: per fold and segment which rows, (n_samples, 1)."""
     if len(segments) == 1:
-        n_rows = segments[0].measured_K.shape[0]
-        return [[np.arange(n_rows)[:, None] >= int((1.0 - FORWARD_SHARE) * n_rows)]]
+        (segment,) = segments
+        n_rows = segment.measured_K.shape[0]
+        told = int(np.searchsorted(segment.record.clock_s, event_s)) + OPENING_SHARE * n_rows
+        return [[np.arange(n_rows)[:, None] >= int(max((1.0 - FORWARD_SHARE) * n_rows, told))]]
     n_folds = min(len(segments), MOST_FOLDS)
     return [
         [~_opening(segment) & (i % n_folds == fold) for i, segment in enumerate(segments)] for fold in range(n_folds)

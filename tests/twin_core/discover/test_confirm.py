@@ -32,18 +32,19 @@ def spec() -> TwinSpec:
     return load_spec(data)
 
 
-def record(missing_W: float) -> Record:
+def record(missing_W: float, from_sample: int = 0) -> Record:
     rng = np.random.default_rng(0)
     time_s, heat = 60.0 * np.arange(200), np.repeat(rng.choice([0.0, 40.0, 90.0], 20), 10)
     capacity = np.array([4.0e3, 7.0e3])
     rates = -laplacian(2, [(0, 1)], [2.5]) / capacity[:, None]
-    drive = np.stack([heat, np.full(200, missing_W)], axis=1) / capacity
+    missing = np.where(np.arange(200) < from_sample, 0.0, missing_W)
+    drive = np.stack([heat, missing], axis=1) / capacity
     read = linear_states(rates, drive, np.array([290.0, 288.0]), time_s) + rng.normal(0.0, NOISE_K, (200, 2))
     return record_of(time_s, Q=heat, T0=read[:, 0], T1=read[:, 1])
 
 
-def declared(missing_W: float) -> Trial:
-    fit, calibration = fit_network(spec(), [record(missing_W)])
+def declared(missing_W: float, from_sample: int = 0) -> Trial:
+    fit, calibration = fit_network(spec(), [record(missing_W, from_sample)])
     return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
 
 
@@ -105,6 +106,18 @@ def test_what_changes_between_sessions_is_no_law(gains: tuple[float, float], exp
     assert validation.ratio < 0.5
     assert (validation.forward_ratio < 0.5) == is_law
     assert (validation.foresight < FORESIGHT) == is_law
+
+
+@pytest.mark.parametrize(("share", "foretells"), [(0.4, True), (0.645, True), (0.8, True), (0.95, False)])
+def test_what_follows_an_event_is_foretold_by_what_has_seen_it(share: float, *, foretells: bool) -> None:
+    """The usual beginning, 65 % of the record, knows nothing of an event at its end; after the last one nothing may follow."""
+    base = declared(20.0, int(200 * share))
+    clock = {"begin_s": 0.0, "span_s": 60.0 * 199, "width_s": 60.0, "dated": False}
+    step = REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 15.0, "time": 60.0 * 200 * share}, clock)
+    trial = try_effects(base, [step], n_passes=12)
+    assert trial.effects[0].values["Q_W"] == pytest.approx(20.0, rel=0.2)
+    ratio = validate(base, trial).forward_ratio
+    assert ratio < 0.5 if foretells else ratio == 1.0
 
 
 @pytest.fixture(scope="module")
