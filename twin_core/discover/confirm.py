@@ -365,8 +365,7 @@ def validate(simple: Trial, rich: Trial) -> Validation:
 def _forward_ratio(simple: Trial, rich: Trial) -> float:
     """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
 
-    An event that comes after the beginning is asked about what follows it: the other parameters of a fit to less would be told
-    by readings that know nothing of it, against those of one that has to make up for it.
+    An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
     """
     known = {effect.place for effect in simple.effects}
     instants = [

@@ -87,9 +87,8 @@ class Finding:
             return self
         rest = self.judged.evidence.log_bayes_factor - worth_of_it
         evidence = replace(self.judged.evidence, log_bayes_factor=rest)
-        others = tuple(
-            j for j in self.alternatives if len(j.effects) <= len(kept)
-        )  # a larger set names what was withdrawn
+        # A larger set would name again what was withdrawn.
+        others = tuple(j for j in self.alternatives if len(j.effects) <= len(kept))
         return Finding(replace(self.judged, effects=kept, evidence=evidence, trial=trial), others)
 
 
