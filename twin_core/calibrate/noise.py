@@ -21,7 +21,7 @@ UNEVEN_ORDER = 4
 """Order of the divided differences there: their points lie further apart, where a curve of second order is no longer one."""
 
 WINSORISED = 2.0
-"""Differences of quantised readings, in units of their own scale, beyond which they count no more. Noise under steps of one to six
+"""Differences of quantised readings, in units of their own scale, beyond which they count no more. Noise under steps of 1 to 6
 times itself is told to 4 % at 1.5, 1 % at 2, 6 % at 2.5 and at 3; one far outlier in ten raises it by 19, 31, 60 and 208 %."""
 SETTLED, MOST_ROUNDS = 1e-4, 100
 """Relative change of that scale at which it has settled, and rounds at most."""
