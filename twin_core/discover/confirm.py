@@ -10,7 +10,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
-from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat, loss_at_start
+from twin_core.calibrate.undeclared.fit import SETTLED_NATS, fit_with_undeclared_heat, loss_at_start
 from twin_core.calibrate.undeclared.model import HeatFit, linearise, log_likelihood
 from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
@@ -29,6 +29,9 @@ counts. A limit of time, not of belief: of 214 fits from both starts, the second
 SHORTER_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Shares of an effect's amplitude for the second start: the first that loses nothing, or the last. Screening takes an amplitude
 to which the other parameters give way; where a fit starts they have not yet."""
+
+MOST_ROUNDS = 8
+"""So often a fit is taken up again until it has converged."""
 
 CONSIDERABLE = 0.1
 """Nodes whose undeclared heat moves them less than this share of the most moved one say nothing about an effect."""
@@ -243,6 +246,23 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     fit = max(own, along, near, key=lambda f: f.log_posterior)
     effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
     return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None)
+
+
+def converged(trial: Trial) -> Trial:
+    """Return a trial whose fit in the presence of undeclared heat takes passes until its likelihood no longer grows.
+
+    A few passes rank candidates, but leave the size of the undeclared heat and its correlation length on their way: whatever
+    is added then, of no size even, seems to gain what the next passes add anyhow.
+    """
+    fit = trial.fit
+    for _ in range(MOST_ROUNDS):
+        before, fit = fit, fit_with_undeclared_heat(fit.problem, fit.free, near=fit)
+        if fit.log_posterior - before.log_posterior < SETTLED_NATS:
+            break
+    if fit.log_posterior - trial.fit.log_posterior < SETTLED_NATS:
+        return trial
+    effects = fitted_effects(trial.effects, fit.network.parameters.as_dict())
+    return replace(trial, effects=effects, fit=fit, near=(trial.calibration().optimum,), simpler=None)
 
 
 def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:

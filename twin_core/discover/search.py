@@ -16,7 +16,7 @@ from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
-from twin_core.discover.confirm import Evidence, Trial, mean_excess, resettled, try_effects, weigh
+from twin_core.discover.confirm import Evidence, Trial, converged, mean_excess, resettled, try_effects, weigh
 from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -96,11 +96,14 @@ def search(
         With the findings in the order in which they were made.
     """
     state = Search(base, base, deadline=deadline, first=first)
+    _converge(state)
+    state.base = state.trial
     needed = threshold(false_alarm_rate)
     now = time.monotonic()
     looking = now + (1.0 - REVISION_SHARE) * (deadline - now)
     for step in range(MAX_FINDINGS):
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
+        _converge(state)
         state.past = (*state.past, state.trial)
         before, known = state.fork(), _places(state)
         with state.until(looking):
@@ -115,6 +118,7 @@ def search(
             state.join(before)
             break
         complete(state, needed)
+        _converge(state)
         prune(state, needed)
         if _places(state) == known:
             break  # what was found does not hold: the next step would find it again
@@ -128,6 +132,11 @@ def search(
     progress(0.95, "comparing what was found with other names")
     tell_alternatives(state, needed)
     return state
+
+
+def _converge(state: Search) -> None:
+    """Take the fit of the model so far to its end, for it is what anything else is weighed against."""
+    state.trial = state.attempt(partial(converged, state.trial), "the model so far") or state.trial
 
 
 def _places(state: Search) -> set[Place]:
