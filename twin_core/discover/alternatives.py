@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from twin_core.calibrate.second_order import Calibration
+from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance
 from twin_core.discover.confirm import (
@@ -62,15 +63,16 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         work = partial(_explaining, state, simple, *option, least, needed)
         return state.attempt(work, f"{option[1].label} instead of {own.label}")
 
-    options = [(start, effect) for start in starts for effect in _near(simple, start, own, known)]
+    about = [about_trajectory(start.problem, start.optimum) for start in starts]
+    fits = [(simple.fit, starts[0]), *zip(about, starts, strict=True)]
+    options = [(start, effect) for fit, start in fits for effect in _near(simple, fit, own, known)]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         told = [j for j in pool.map(compared, options) if j is not None]
     return Finding(finding.judged, (*finding.alternatives, *once_each(told)))
 
 
-def _near(simple: Trial, start: Calibration, own: Effect, known: Collection[Place]) -> list[Effect]:
-    """Return the effects that linear screening about a calibration hardly tells from one that was found, the best first."""
-    about = about_trajectory(start.problem, start.optimum)
+def _near(simple: Trial, about: HeatFit, own: Effect, known: Collection[Place]) -> list[Effect]:
+    """Return the effects that linear screening about a fit hardly tells from one that was found, the best first."""
     probes = best_of_each_place(
         screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
     )

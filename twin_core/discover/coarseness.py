@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from twin_core.calibrate.containment import attempted
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial, mean_excess
+from twin_core.discover.confirm import Trial, mean_excess, validate
 
 
 def by_chance(n_readings: int) -> float:
@@ -28,7 +29,21 @@ def least_explained(beside: float, left: float, n_readings: int) -> float:
     return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
 
 
+def foretold(simple: Trial, rich: Trial) -> float:
+    """Return how much of what is asked of names remains where they foretell what they were not fitted to.
+
+    Coarseness is explained where it was seen; what is really there is foretold. Names that leave less of the variance of that
+    error than coarseness could, half of it for a dominance of two, have so much less to explain. What cannot be computed is
+    not foretold.
+    """
+    told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", [])
+    return 1.0 if told is None else min(1.0, policy.DOMINANCE * told**2)
+
+
 def stands(simple: Trial, rich: Trial) -> bool:
     """Return whether what was added explains so much more than what stays beside it that it would not be withdrawn."""
     left, n_readings = mean_excess(rich), rich.n_samples
-    return left <= by_chance(n_readings) or mean_excess(simple) - left >= least_explained(left, left, n_readings)
+    if left <= by_chance(n_readings):
+        return True
+    explained, asked = mean_excess(simple) - left, least_explained(left, left, n_readings)
+    return explained >= asked or explained >= asked * foretold(simple, rich)

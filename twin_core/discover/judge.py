@@ -22,8 +22,8 @@ from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
 
-N_VALIDATED, N_VALIDATED_FREE = 3, 8
-"""Options that are validated at most: of named effects, and of free forms, which come in several degrees."""
+N_VALIDATED = 8
+"""Options that are validated at most."""
 
 Without = tuple[Trial, float]
 """A trial without some of its effects, and their log Bayes factor."""
@@ -187,19 +187,21 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     judged = simplest_first(once_each(options))
     is_free = any(effect.fallback for j in judged[:1] for effect in j.effects)
     weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
-    most = N_VALIDATED_FREE if is_free else N_VALIDATED
     refused: list[Judged] = []
     passed: list[Judged] = []
+    unlike: list[Trial] = []
     for best in judged:
         n_validated = sum(j.validation is not None for j in refused) + len(passed)
-        if best.evidence.log_bayes_factor <= needed or n_validated >= most:
+        if best.evidence.log_bayes_factor <= needed or n_validated >= N_VALIDATED:
             continue
+        if any(mean_excess(best.trial) >= mean_excess(trial) for trial in unlike):
+            continue  # what explains less is no better a name for this heat
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         if own.reason:
             refused.append(own)
             if resembles:
-                break  # what explains less is no better a name for this heat
+                unlike.append(own.trial)
         else:
             passed.append(own)
             if is_free or stands(state.trial, own.trial):

@@ -10,8 +10,8 @@ import numpy as np
 
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.coarseness import by_chance, least_explained
-from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
+from twin_core.discover.coarseness import by_chance, foretold, least_explained
+from twin_core.discover.confirm import Trial, mean_excess, try_effects, validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_MORE,
@@ -53,8 +53,9 @@ def withdraw(state: Search, needed: float) -> None:
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
             asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
         without = _without_each(state, asked)
+        named = {f.judged.places for f in state.findings if not all(effect.fallback for effect in f.effects)}
         told = {
-            places: (mean_excess(kept[0]) - left) / asked[places] if asked[places] > 0.0 else np.inf
+            places: _told(kept[0], state.trial, asked[places], is_named=places in named)
             for places, kept in without.items()
             if kept
         }
@@ -72,6 +73,14 @@ def withdraw(state: Search, needed: float) -> None:
         _drop(state, weakest, *kept)
         for rest in filter(None, rests):
             _examine_again(state, rest, needed)
+
+
+def _told(without: Trial, trial: Trial, asked: float, *, is_named: bool) -> float:
+    """Return how many times what is asked of them effects explain; names that foretell have less to explain."""
+    explained = mean_excess(without) - mean_excess(trial)
+    if is_named and explained < asked:
+        asked *= foretold(without, trial)
+    return explained / asked if asked > 0.0 else np.inf
 
 
 def _examine_again(state: Search, places: Collection[object], needed: float, *, foresight: float = -np.inf) -> None:
@@ -153,10 +162,18 @@ def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> boo
     return False
 
 
-def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float, margin: float | None = None) -> bool:
+def _in_place_of(
+    state: Search,
+    finding: Finding,
+    option: Judged,
+    needed: float,
+    margin: float | None = None,
+    foresight: float = np.inf,
+) -> bool:
     """Take an option instead of a finding, if it is likelier by a margin and passes; return whether it did.
 
-    The margin is the odds asked for unless it is given; supported by these the option must be in any case.
+    The margin is the odds asked for unless it is given; supported by these the option must be in any case. Its error on what it
+    was not fitted to must be below ``foresight`` times that of the finding.
     """
     places = finding.judged.places
     kept = _attempted_without(state, places)
@@ -169,6 +186,8 @@ def _in_place_of(state: Search, finding: Finding, option: Judged, needed: float,
         return False
     examined, _ = examine(without, instead, needed)
     if examined.reason:
+        return False
+    if foresight < np.inf and not foresight_of(examined) < foresight * validate(without, state.trial).foresight:
         return False
     state.rejected = [j for j in state.rejected if j.effects != option.effects]
     state.rejected.append(replace(finding.judged, reason=OUTDONE))
@@ -255,20 +274,27 @@ def tell_alternatives(state: Search, needed: float) -> None:
 
 
 def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
-    """Exchange a finding for the best of its alternatives that passes, if it is simpler, or likelier by the odds asked for.
+    """Exchange a finding for the best of its alternatives that passes, if it is simpler, far likelier, or predicts better.
 
     Alternatives explain as much where a coarse network makes nats say little, so that the simplest leads (and the likeliest of
     these): what has more freedom fits the coarseness too. The first look ranks by linear responses, and what it left out may
-    turn out to explain more. The finding is an alternative then.
+    turn out to explain more: likelier by the odds asked for, or leaving less and predicting better what it was not fitted to.
+    The finding is an alternative then.
     """
     finding = state.findings[position]
     options = (finding.judged, *finding.alternatives)
     simplest = [j for j in options if _freedom(j) == min(map(_freedom, options))]
-    better, margin = simplest, -np.inf
+    better = [(j, -np.inf, np.inf) for j in sorted(simplest, key=worth)]
     if finding.judged in simplest:
-        better, margin = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed], needed
-    for best in sorted(better, key=worth):
-        replaced = partial(_in_place_of, state, finding, best, needed, margin)
+        likelier = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed]
+        left = mean_excess(state.trial)
+        less = [j for j in simplest if j is not finding.judged and mean_excess(j.trial) < left]
+        better = [(j, needed, np.inf) for j in sorted(likelier, key=worth)]
+        better += [
+            (j, -np.inf, policy.FORESIGHT) for j in sorted(less, key=lambda j: mean_excess(j.trial))[:N_EXCHANGED]
+        ]
+    for best, margin, foresight in better:
+        replaced = partial(_in_place_of, state, finding, best, needed, margin, foresight)
         if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
             others = [option for option in finding.alternatives if option is not best]
             alternatives = tuple(sorted((finding.judged, *others), key=worth))

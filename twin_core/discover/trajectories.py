@@ -21,7 +21,7 @@ from twin_core.discover.judge import Judged, Search, accept, once_each, worth
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.effects.base import Effect, Place
 
-N_REFITS = 6
+N_REFITS, N_NEAR = 6, 9
 TOGETHER_MISFIT_SHARE = 3.0
 """Misfit over noise above which two effects are tried together where none helps alone: more fit anything on a long trajectory."""
 
@@ -89,8 +89,12 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
         work = partial(_fitted, state, seed, effect, comb(n_tried, n_together))
         return state.attempt(work, f"{effect.label} on trajectories")
 
+    options = refined(fit, shortlist(rankings, needed, N_REFITS))
+    if n_together == 1:
+        near = screened(seed, seed.fit, UNDECLARED_SHARES[-1:], fallback=fallback)[0]
+        options += refined(seed.fit, shortlist([best_of_each_place(near.probes, seed.n_samples)], needed, N_NEAR))
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        judged = list(pool.map(fitted, refined(fit, shortlist(rankings, needed, N_REFITS))))
+        judged = list(pool.map(fitted, options))
     return [j for j in judged if j is not None]
 
 

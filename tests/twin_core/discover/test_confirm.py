@@ -12,8 +12,9 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
 from twin_core.discover import confirm
-from twin_core.discover.confirm import Trial, try_effects, validate, weigh
+from twin_core.discover.confirm import Trial, converged, try_effects, validate, weigh
 from twin_core.discover.left_out import N_BLOCKS, blocked_errors
 from twin_core.discover.policy import FORESIGHT
 from twin_core.effects import REGISTRY
@@ -55,6 +56,20 @@ def test_an_effect_that_starts_far_too_large_ends_no_less_likely_than_none(monke
     assert try_effects(base, [vast]).fit.log_posterior > base.fit.log_posterior - 3.0
     monkeypatch.setattr(confirm, "START_LOSS_NATS", np.inf)
     assert try_effects(base, [vast]).fit.log_posterior < base.fit.log_posterior - 30.0
+
+
+def test_an_effect_of_no_size_gains_nothing_over_a_fit_that_has_converged() -> None:
+    """A fit that ended early leaves to whatever is added next what its own next passes would have gained."""
+    base = declared(0.0)
+    large = replace(base.fit.undeclared, std_W=100.0 * base.fit.undeclared.std_W)
+    near = replace(base.fit, undeclared=large)
+    early = replace(base, fit=fit_with_undeclared_heat(near.problem, near.free, near=near, n_passes=1))
+    settled = converged(early)
+    assert settled.fit.log_posterior > early.fit.log_posterior + 1.0
+    assert converged(settled) is settled
+    nothing = REGISTRY["constant_heat_load"]({"node": "n1"}, {"Q_W": 1e-6})
+    assert try_effects(settled, [nothing], n_passes=12).fit.log_posterior < settled.fit.log_posterior + 2.0
+    assert try_effects(early, [nothing], n_passes=12).fit.log_posterior > early.fit.log_posterior + 1.0
 
 
 def test_a_share_of_an_effect_lies_between_it_and_none() -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin_core.discover import judge, policy, revision, trajectories
+from twin_core.discover import coarseness, judge, policy, revision, trajectories
 from twin_core.discover import search as searching
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
@@ -77,6 +77,7 @@ class Stub:
     left: float = 0.0
     n_free: int = 3
     n_samples: int = N_READINGS
+    foresight: float = 1.0
     fit: Fit = field(init=False)
 
     def __post_init__(self) -> None:
@@ -86,8 +87,19 @@ class Stub:
         return np.array([2.0 * self.left, 0.0])
 
 
-def stub(*effects: Effect, left: float = 0.0, n_free: int = 3) -> Trial:
-    return cast(Trial, Stub(tuple(effects), left, n_free))
+def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
+    return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))
+
+
+@pytest.fixture(autouse=True)
+def foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stub foretells is what it says."""
+
+    def told(simple: Trial, rich: Any) -> Validation:
+        return Validation(rich.foresight, 1.0, rich.foresight, 0.1, 1.0)
+
+    monkeypatch.setattr(coarseness, "validate", told)
+    monkeypatch.setattr(revision, "validate", told)
 
 
 def load(node: str) -> Effect:
@@ -189,7 +201,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         ([judged("form", 90.0), judged("b", 60.0)], None, [NO_LAW]),
         ([judged("form", 90.0), judged("b", 3.0)], None, [NO_LAW, NOT_SUPPORTED]),
         ([*(judged(f"x{i}", 90.0 - i) for i in range(5)), judged("b", 60.0)], "b", [LESS_LIKELY] * 5),
-        ([*(judged(f"a{i}", 90.0 - i, foresight=1.0) for i in range(3)), judged("b", 60.0)], None, [NO_FORESIGHT] * 3),
+        ([*(judged(f"a{i}", 90.0 - i, foresight=1.0) for i in range(8)), judged("b", 60.0)], None, [NO_FORESIGHT] * 8),
     ],
     ids=[
         "likely",
@@ -241,6 +253,28 @@ def test_open_loop_residuals_are_asked_too_where_a_name_would_be_withdrawn(
     before: float, left: float, kept: bool
 ) -> None:
     assert stands(stub(left=before), stub(load("n0"), left=left)) == kept
+
+
+@pytest.mark.parametrize("foresight", [1.0, 0.8, DOMINANCE**-0.5, 0.6, 0.3])
+def test_what_foretells_has_less_to_explain(monkeypatch: pytest.MonkeyPatch, foresight: float) -> None:
+    """In proportion to the variance that it leaves of what it was not fitted to, from half of it on."""
+    asked = DOMINANCE * LEAST * min(1.0, DOMINANCE * foresight**2)
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    for more, kept in ((JUST, True), (-JUST, False)):
+        rich = stub(load("n0"), left=0.5, foresight=foresight)
+        simple = stub(left=0.5 + asked + more)
+        assert stands(simple, rich) == kept
+        state = Search(rich, simple, findings=[Finding(judged("n0", 50.0))])
+        withdraw(state, NEEDED)
+        assert bool(state.findings) == kept
+
+
+def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(simple: Trial, rich: Trial) -> Validation:
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(coarseness, "validate", fails)
+    assert coarseness.foretold(stub(), stub(load("n0"))) == 1.0
 
 
 @pytest.mark.parametrize(
@@ -707,6 +741,33 @@ def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
     assert names == (["boundary_mix", "constant_heat_load"] if leads != "boundary_mix" else ["constant_heat_load"] * 2)
     if leads == "constant_heat_load":
         assert finding.effects[0].where == {"node": "a"}
+
+
+@pytest.mark.parametrize(
+    ("left", "foresight", "leads"),
+    [(2.0 - JUST, 0.9 * FORESIGHT - JUST, "b"), (2.0 - JUST, 0.9 * FORESIGHT, "a"), (2.0, 0.1, "a")],
+    ids=["predicts better", "hardly better", "leaves as much"],
+)
+def test_of_names_alike_the_one_leads_that_leaves_less_and_predicts_better(
+    monkeypatch: pytest.MonkeyPatch, left: float, foresight: float, leads: str
+) -> None:
+    """However little the evidence speaks for it: where a network is coarse, nats say little."""
+    found = judged("a", 90.0)
+    option = judged("b", 40.0, left=left, foresight=foresight)
+    told = Finding(found, (option,))
+    trials = {"b": option.trial}
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: trials[effects[0].where["node"]])
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(40.0, 0.0))
+    monkeypatch.setattr(
+        revision, "examine", lambda simple, judged, needed: (replace(judged, validation=option.validation), False)
+    )
+    state = Search(stub(load("a"), left=2.0, foresight=0.9), stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    (finding,) = state.findings
+    assert [e.where["node"] for e in finding.effects] == [leads]
+    assert [a.effects[0].where["node"] for a in finding.alternatives] == [{"a": "b", "b": "a"}[leads]]
 
 
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
