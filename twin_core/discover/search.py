@@ -164,18 +164,23 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         state.join(by_heat)
         return told
 
-    def look(seeds: Sequence[Trial], n_together: int) -> tuple[bool, list[Trial]]:
+    def look(fork: Search, seeds: Sequence[Trial], n_together: int) -> tuple[bool, list[Trial]]:
         known = by_heat.findings[-1].judged.places if told else ()
-        second = partial(extend_by_trajectory, by_trajectory, needed, seeds, n_together, fallback=fallback, known=known)
+        second = partial(extend_by_trajectory, fork, needed, seeds, n_together, fallback=fallback, known=known)
         return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
 
-    misfit = state.attempt(state.trial.misfit_share, "how much trajectories leave") or 0.0
-    seen, sets = look([state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
-    if together and sets and not seen and misfit >= TOGETHER_MISFIT_SHARE:
+    def leaves(trial: Trial) -> float:
+        return state.attempt(trial.misfit_share, "how much trajectories leave") or 0.0
+
+    by_pairs, paired = state.fork(), False
+    misfit = leaves(state.trial)
+    seen, sets = look(by_trajectory, [state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
+    if together and sets and misfit >= TOGETHER_MISFIT_SHARE <= (leaves(by_trajectory.trial) if seen else np.inf):
         beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
-        seen, _ = look([*sets, *beside], 2)
-    options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen)) if found]
-    refused = [*by_trajectory.rejected, *by_heat.rejected[len(state.rejected) :]]
+        paired, _ = look(by_pairs, [*sets, *beside], 2)
+    options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen), (by_pairs, paired)) if found]
+    n = len(state.rejected)
+    refused = [*by_trajectory.rejected, *by_pairs.rejected[n:], *by_heat.rejected[n:]]
     if not options:
         state.rejected = refused
         return False

@@ -22,6 +22,8 @@ from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, 
 from twin_core.effects.base import Effect, Place
 
 N_REFITS, N_NEAR = 6, 9
+"""Effects that are fitted on trajectories: suggested by what these leave, and by what the filter leaves beside little heat."""
+
 TOGETHER_MISFIT_SHARE = 3.0
 """Misfit over noise above which two effects are tried together where none helps alone: more fit anything on a long trajectory."""
 
@@ -68,10 +70,12 @@ def extend_by_trajectory(
         The best trials are the seeds of a next look, at one effect more together.
     """
     judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
-    sets = once_each(judged)[:N_KEPT]
-    if not sets:
+    # What the filter suggests beside little heat is no seed: it is far from where long trajectories point.
+    near = _extended_near(state, needed, fallback=fallback) if n_together == 1 else []
+    sets, best = once_each(judged)[:N_KEPT], once_each([*judged, *near])[:N_KEPT]
+    if not best:
         return False, []
-    options = [*_settled(state, sets[:N_SETTLED], comb(state.n_named, n_together), needed), *sets]
+    options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
     if min(options, key=worth).places == known:
         return False, []
     return accept(state, options, needed), [j.trial for j in sets]
@@ -84,17 +88,31 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     screenings = screened(seed, fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
+    effects = refined(fit, shortlist(rankings, needed, N_REFITS))
+    return _all_fitted(state, seed, effects, comb(n_tried, n_together))
+
+
+def _extended_near(state: Search, needed: float, *, fallback: bool) -> list[Judged]:
+    """Return what effects make of the state's model that are screened about the measured temperatures, beside little heat.
+
+    Where a model misses much, its own trajectories lie far from the measured ones, and what answers there is another effect.
+    """
+    trial = state.trial
+    (screening,) = screened(trial, trial.fit, UNDECLARED_SHARES[-1:], fallback=fallback)
+    ranking = best_of_each_place(screening.probes, trial.n_samples)
+    effects = refined(trial.fit, shortlist([ranking], needed, N_NEAR))
+    return _all_fitted(state, trial, effects, state.count(len(ranking), fallback=fallback))
+
+
+def _all_fitted(state: Search, seed: Trial, effects: Sequence[Effect], n_tried: int) -> list[Judged]:
+    """Return a trial with each of some effects on top, fitted on trajectories and judged against the state's model."""
 
     def fitted(effect: Effect) -> Judged | None:
-        work = partial(_fitted, state, seed, effect, comb(n_tried, n_together))
+        work = partial(_fitted, state, seed, effect, n_tried)
         return state.attempt(work, f"{effect.label} on trajectories")
 
-    options = refined(fit, shortlist(rankings, needed, N_REFITS))
-    if n_together == 1:
-        near = screened(seed, seed.fit, UNDECLARED_SHARES[-1:], fallback=fallback)[0]
-        options += refined(seed.fit, shortlist([best_of_each_place(near.probes, seed.n_samples)], needed, N_NEAR))
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        judged = list(pool.map(fitted, options))
+        judged = list(pool.map(fitted, effects))
     return [j for j in judged if j is not None]
 
 

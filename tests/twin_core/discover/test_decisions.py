@@ -1,7 +1,6 @@
-"""The deciding rooms at their boundaries: what is likely enough, what predicts, what stands, and what goes first."""
+"""The deciding rooms at their boundaries: what is likely enough, what predicts, what is named."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from threading import Barrier, Thread
 from types import SimpleNamespace
 from typing import Any, cast
@@ -11,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from twin_core.discover import coarseness, judge, policy, revision, trajectories
+from tests.twin_core.discover.stubs import CHANCE, JUST, LEAST, MOST, NEEDED, Problem, Stub, judged, load, stub
+from twin_core.discover import coarseness, judge, policy, trajectories
 from twin_core.discover import search as searching
 from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
@@ -22,7 +22,6 @@ from twin_core.discover.judge import (
     NO_LAW,
     NO_MORE,
     NOT_SUPPORTED,
-    OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     Finding,
@@ -40,80 +39,15 @@ from twin_core.discover.policy import (
     ALTERNATIVE_NATS,
     DOMINANCE,
     FORESIGHT,
-    LEAST_COARSENESS,
-    LEAST_EXCESS,
     MOST_COARSENESS,
     REPEATABLE_SHARE,
     THRESHOLDS,
     VISIBLE_COARSENESS,
 )
-from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect
 
-JUST = 1e-6
-NEEDED = 4.6
-LEAST, MOST = LEAST_COARSENESS, MOST_COARSENESS
-N_READINGS = 5000
-CHANCE = VISIBLE_COARSENESS * float(np.sqrt(2.0 / N_READINGS))
-
-
-@dataclass
-class Problem:
-    n_free: int
-
-
-@dataclass
-class Fit:
-    problem: Problem
-
-
-@dataclass
-class Stub:
-    """A trial of which only the excess and the number of its parameters count."""
-
-    effects: tuple[Effect, ...] = ()
-    left: float = 0.0
-    n_free: int = 3
-    n_samples: int = N_READINGS
-    foresight: float = 1.0
-    fit: Fit = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.fit = Fit(Problem(self.n_free))
-
-    def excess(self) -> Any:
-        return np.array([2.0 * self.left, 0.0])
-
-
-def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
-    return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))
-
-
-@pytest.fixture(autouse=True)
-def foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a stub foretells is what it says."""
-
-    def told(simple: Trial, rich: Any) -> Validation:
-        return Validation(rich.foresight, 1.0, rich.foresight, 0.1, 1.0)
-
-    monkeypatch.setattr(coarseness, "validate", told)
-    monkeypatch.setattr(revision, "validate", told)
-
-
-def load(node: str) -> Effect:
-    return REGISTRY["constant_heat_load"]({"node": node}, {"Q_W": 1.0})
-
-
-def unnamed() -> Effect:
-    """Return an effect that claims no law; of its kind alone counts."""
-    return cast(Effect, type("Free", (), {"fallback": True, "place": "n0", "label": "free(n0)"})())
-
-
-def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresight: float = 0.5) -> Judged:
-    validation = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
-    return Judged((load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free), validation)
+pytestmark = pytest.mark.usefixtures("foreseen")
 
 
 @pytest.mark.parametrize("rate", [0.5, 0.01, 1e-6])
@@ -255,215 +189,12 @@ def test_open_loop_residuals_are_asked_too_where_a_name_would_be_withdrawn(
     assert stands(stub(left=before), stub(load("n0"), left=left)) == kept
 
 
-@pytest.mark.parametrize("foresight", [1.0, 0.8, DOMINANCE**-0.5, 0.6, 0.3])
-def test_what_foretells_has_less_to_explain(monkeypatch: pytest.MonkeyPatch, foresight: float) -> None:
-    """In proportion to the variance that it leaves of what it was not fitted to, from half of it on."""
-    asked = DOMINANCE * LEAST * min(1.0, DOMINANCE * foresight**2)
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    for more, kept in ((JUST, True), (-JUST, False)):
-        rich = stub(load("n0"), left=0.5, foresight=foresight)
-        simple = stub(left=0.5 + asked + more)
-        assert stands(simple, rich) == kept
-        state = Search(rich, simple, findings=[Finding(judged("n0", 50.0))])
-        withdraw(state, NEEDED)
-        assert bool(state.findings) == kept
-
-
 def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(simple: Trial, rich: Trial) -> Validation:
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(coarseness, "validate", fails)
     assert coarseness.foretold(stub(), stub(load("n0"))) == 1.0
-
-
-@pytest.mark.parametrize(
-    ("explained", "left", "kept"),
-    [
-        ([5.0, 0.2], 0.0, ["n0", "n1"]),
-        ([9.0, DOMINANCE * CHANCE], CHANCE, ["n0", "n1"]),
-        ([9.0, DOMINANCE * LEAST], 2.0 * CHANCE, ["n0", "n1"]),
-        ([9.0, DOMINANCE * LEAST - JUST], 2.0 * CHANCE, ["n0"]),
-        ([0.2, 9.0], 0.5, ["n1"]),
-        ([2.0, 2.5], 0.5, []),
-        ([DOMINANCE * MOST, 900.0], 50.0, ["n0", "n1"]),
-        ([DOMINANCE * MOST - JUST, 900.0], 50.0, ["n1"]),
-    ],
-    ids=[
-        "fits to the noise",
-        "by chance",
-        "just enough",
-        "too little",
-        "the weakest",
-        "each beside the other",
-        "coarsest",
-        "within it",
-    ],
-)
-def test_what_explains_no_more_than_what_stays_is_withdrawn(
-    monkeypatch: pytest.MonkeyPatch, explained: list[float], left: float, kept: list[str]
-) -> None:
-    """What a withdrawn finding explained is unexplained from then on."""
-    own = {f"n{i}": value for i, value in enumerate(explained)}
-
-    def refitted(effects: tuple[Effect, ...]) -> Trial:
-        names = {e.where["node"] for e in effects}
-        return stub(*effects, left=left + sum(value for name, value in own.items() if name not in names))
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    state = Search(refitted(tuple(load(name) for name in own)), refitted(()))
-    state.findings = [Finding(judged(name, 50.0)) for name in own]
-    withdraw(state, NEEDED)
-    assert [f.effects[0].where["node"] for f in state.findings] == kept
-    assert [e.where["node"] for e in state.trial.effects] == kept
-    assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
-
-
-def test_a_model_without_a_finding_is_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pruning and withdrawing ask for the same fits; another trial asks for its own."""
-    fitted: list[tuple[str, ...]] = []
-
-    def refitted(effects: tuple[Effect, ...]) -> Trial:
-        names = tuple(e.where["node"] for e in effects)
-        fitted.append(names)
-        return stub(*effects, left=9.0 * (2 - len(names)))
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(50.0, 1.0))
-    state = Search(stub(load("a"), load("b"), left=0.5), stub(left=18.0))
-    state.findings = [Finding(judged("a", 50.0)), Finding(judged("b", 50.0))]
-    prune(state, NEEDED)
-    withdraw(state, NEEDED)
-    assert [f.effects[0].where["node"] for f in state.findings] == ["a", "b"]
-    once = [("a",), ("a",), ("b",), ("b",)]  # from the model with both, and from the one with none
-    assert sorted(fitted) == once
-    state.trial = stub(load("a"), load("b"), left=0.6)
-    withdraw(state, NEEDED)
-    assert sorted(fitted) == sorted(2 * once)
-
-
-def test_without_a_finding_the_search_is_where_it_was_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was fitted beside another effect may be caught far from where it belongs alone: its own fit is kept."""
-
-    def caught(trial: Trial, effects: Sequence[Effect], n_passes: int) -> Trial:
-        return stub(*effects, left=9.0)
-
-    monkeypatch.setattr(revision, "try_effects", caught)
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(50.0, 1.0))
-    before = stub(load("a"), left=1.5)
-    state = Search(stub(load("a"), load("b"), left=0.5), stub(left=18.0), past=(stub(left=18.0), before))
-    state.findings = [Finding(judged("a", 50.0)), Finding(judged("b", 50.0))]
-    withdraw(state, NEEDED)
-    assert state.trial is before and [f.effects[0].where["node"] for f in state.findings] == ["a"]
-
-
-def test_what_was_compared_with_a_set_is_no_alternative_to_what_stays_of_it() -> None:
-    pair, other = judged("a", 50.0), judged("c", 49.0)
-    pair = replace(pair, effects=(load("a"), load("b")))
-    alike = replace(pair, effects=(load("a"), load("d")))
-    left = Finding(pair, (alike, other)).without(load("b").place, 20.0, stub(load("a")))
-    assert [e.where["node"] for e in left.effects] == ["a"] and left.alternatives == (other,)
-
-
-@pytest.mark.parametrize(
-    ("nats", "explains", "reason", "foresight", "kept"),
-    [
-        (NEEDED + JUST, LEAST_EXCESS + JUST, NO_FORESIGHT, 2.0, ["a", "b"]),
-        (NEEDED, 9.0, "", 0.5, ["a"]),
-        (90.0, LEAST_EXCESS - JUST, "", 0.5, ["a"]),
-        (NEEDED, 9.0, SIZE_NOT_DETERMINED, 0.5, []),
-        (NEEDED, 9.0, NO_FORESIGHT, 1.0 - JUST, ["a"]),
-        (NEEDED, 9.0, NO_FORESIGHT, 1.0, []),
-    ],
-    ids=["enough", "hardly supported", "next to nothing", "nothing by itself", "no worse by itself", "worse by itself"],
-)
-def test_beside_the_others_each_must_be_supported_and_explain_something(
-    monkeypatch: pytest.MonkeyPatch, nats: float, explains: float, reason: str, foresight: float, kept: list[str]
-) -> None:
-    """The search would not look for less: it is no finding because it came with another, which stands alone or not at all."""
-    own = {"a": 9.0, "b": 0.5 * explains}  # at one sensor of two twice as much as in the mean
-    support = {"a": 90.0, "b": nats}
-
-    def refitted(effects: Sequence[Effect]) -> Trial:
-        names = {str(e.where["node"]) for e in effects}
-        return stub(*effects, left=sum(value for name, value in own.items() if name not in names))
-
-    def weighed(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-        (lost,) = {str(e.where["node"]) for e in rich.effects} - {str(e.where["node"]) for e in simple.effects}
-        return Evidence(support[lost], 0.0)
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
-    monkeypatch.setattr(revision, "weigh", weighed)
-    told = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
-    monkeypatch.setattr(
-        revision, "examine", lambda simple, option, needed: (replace(option, validation=told, reason=reason), False)
-    )
-    pair = refitted((load("a"), load("b")))
-    state = Search(pair, refitted(()), findings=[Finding(Judged(pair.effects, Evidence(99.0, 0.0), pair))])
-    prune(state, NEEDED)
-    assert [e.where["node"] for f in state.findings for e in f.effects] == kept
-    assert [e.where["node"] for e in state.trial.effects] == kept
-
-
-def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As an ablation sets them."""
-    monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=1.0))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    state = Search(stub(load("n0"), left=1.0), stub(left=1.0), findings=[Finding(judged("n0", 50.0))])
-    withdraw(state, NEEDED)
-    assert state.findings
-
-
-@pytest.mark.parametrize(
-    ("own", "reason", "kept"),
-    [
-        ((DOMINANCE * LEAST - JUST, 90.0), "", ["n1"]),
-        ((DOMINANCE * LEAST - JUST, 90.0), SMALL_REMAINDER, ["n1"]),
-        ((DOMINANCE * LEAST - JUST, 90.0), NO_FORESIGHT, []),
-        ((DOMINANCE * LEAST, DOMINANCE * LEAST), NO_FORESIGHT, ["n0", "n1"]),
-    ],
-    ids=["one too little", "the other leaves little", "the other is nothing by itself", "both enough"],
-)
-def test_of_effects_found_together_each_must_explain_something(
-    monkeypatch: pytest.MonkeyPatch, own: tuple[float, float], reason: str, kept: list[str]
-) -> None:
-    """Both together explain enough, in a network that is hardly seen to be coarse; what is left alone is examined anew."""
-    parts, left = {"n0": own[0], "n1": own[1]}, 2.0 * CHANCE
-
-    def refitted(effects: tuple[Effect, ...]) -> Trial:
-        names = {e.where["node"] for e in effects}
-        return stub(*effects, left=left + sum(value for name, value in parts.items() if name not in names))
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    asked: list[tuple[Effect, ...]] = []
-
-    def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
-        asked.append(option.effects)
-        return replace(option, reason=reason), False
-
-    monkeypatch.setattr(revision, "examine", examined)
-    both = (load("n0"), load("n1"))
-    state = Search(refitted(both), refitted(()))
-    state.findings = [Finding(Judged(both, Evidence(50.0, 0.0), state.trial))]
-    withdraw(state, NEEDED)
-    assert [effect.where["node"] for finding in state.findings for effect in finding.effects] == kept
-    assert asked == ([] if len(kept) == 2 else [both[1:]])
-
-
-@pytest.mark.parametrize(("explained", "stands"), [(DOMINANCE * 50.0, True), (DOMINANCE * 50.0 - JUST, False)])
-def test_beside_a_heat_without_a_name_all_that_stays_counts(
-    monkeypatch: pytest.MonkeyPatch, explained: float, stands: bool
-) -> None:
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    free = unnamed()
-    option = Judged((free,), Evidence(50.0, 0.0), stub(free))
-    state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
-    state.findings = [Finding(option)]
-    withdraw(state, NEEDED)
-    assert bool(state.findings) == stands
 
 
 SCORE = score_needed(NEEDED)
@@ -549,233 +280,6 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
         patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: 1e9)
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
-
-
-@pytest.mark.parametrize(
-    ("foresight", "nats", "names"),
-    [
-        (None, 0.0, ["a"]),
-        (0.5 / FORESIGHT + JUST, 900.0, ["a"]),
-        (0.5 / FORESIGHT - JUST, 900.0, ["f"]),
-        (0.5 * FORESIGHT + JUST, 90.0 - JUST, ["a"]),
-        (0.5 * FORESIGHT + JUST, 90.0, ["f"]),
-        (0.5 * FORESIGHT - JUST, 0.0, ["f"]),
-    ],
-    ids=["no heat", "predicts better", "as well, less likely", "as well, likelier", "as likely", "predicts worse"],
-)
-def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
-    foresight: float | None, nats: float, names: list[str]
-) -> None:
-    state = Search(stub(), stub())
-    if foresight is not None:
-        state.findings = [Finding(replace(judged("f", nats, foresight=foresight), effects=(unnamed(),)))]
-    likely, less = (replace(judged(node, nats), reason=SMALL_REMAINDER) for node, nats in (("a", 90.0), ("b", 60.0)))
-    state.rejected = [replace(judged("c", 99.0), reason=NO_LAW), less, likely]
-    reconsider(state, NEEDED)
-    named = names == ["a"]
-    assert [effect.fallback for f in state.findings for effect in f.effects] == [not named]
-    assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
-    assert (state.trial is likely.trial) == named
-
-
-@pytest.mark.parametrize(
-    ("nats", "foresight", "names"),
-    [
-        (90.0, 0.5, ["a"]),
-        (60.0, 0.5, ["f"]),
-        (90.0, 0.7, ["f"]),
-    ],
-    ids=["likelier and predicts better", "less likely", "predicts worse"],
-)
-def test_no_name_stands_that_one_refused_for_the_little_it_leaves_excels(
-    nats: float, foresight: float, names: list[str]
-) -> None:
-    """Less likely, and it predicts worse: what the other one leaves is no reason to name this one."""
-    found = judged("f", 70.0, foresight=0.6)
-    state = Search(found.trial, stub(), findings=[Finding(found)])
-    state.rejected = [replace(judged("a", nats, foresight=foresight), reason=SMALL_REMAINDER)]
-    reconsider(state, NEEDED)
-    assert [f.effects[0].where["node"] for f in state.findings] == names
-    assert [j.reason for j in state.rejected] == ([OUTDONE] if names == ["a"] else [SMALL_REMAINDER])
-
-
-def test_what_stands_in_part_only_gives_way_to_what_stands_whole(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the likelier pair one effect explains next to nothing: its other half is no answer to what the pair was found for."""
-    left = 2.0 * CHANCE
-
-    def refitted(effects: Sequence[Effect]) -> Trial:
-        names = {str(e.where["node"]) for e in effects}
-        return stub(*effects, left=left + (0.0 if names & {"a", "c"} else 99.0))
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (judged, False))
-    both = (load("a"), load("b"))
-    pair = Judged(both, Evidence(99.0, 0.0), refitted(both), None, SMALL_REMAINDER)
-    single = Judged((load("c"),), Evidence(70.0, 0.0), refitted([load("c")]), None, SMALL_REMAINDER)
-    state = Search(refitted(()), refitted(()), rejected=[pair, single])
-    reconsider(state, NEEDED)
-    assert [e.where["node"] for f in state.findings for e in f.effects] == ["c"]
-    assert pair in state.rejected and single not in state.rejected
-
-
-def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
-    effect = REGISTRY[kind]({"node": node}, {})
-    return Judged((effect,), Evidence(nats, 0.0), stub(effect), None, reason)
-
-
-@pytest.mark.parametrize(
-    ("option", "alone", "reason", "named"),
-    [
-        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED + JUST, "", "thermostat_heater"),
-        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED, "", "heat_load_step"),
-        (kind_at("thermostat_heater", "n0", 90.0), 99.0, NO_LAW, "heat_load_step"),
-        (kind_at("thermostat_heater", "n0", 20.0), 99.0, "", "heat_load_step"),
-        (kind_at("thermostat_heater", "n1", 90.0), 99.0, "", "heat_load_step"),
-    ],
-    ids=["explains more", "hardly more", "is no law", "was worth less beside it", "acts elsewhere"],
-)
-def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
-    monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
-) -> None:
-    monkeypatch.setattr(revision, "touched_nodes", lambda effect, layout: {effect.where["node"]})
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 30.0))
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
-    found = kind_at("heat_load_step", "n0", 30.0)
-    cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
-    refused = replace(option, reason=NO_FORESIGHT)
-    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[refused])
-    assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
-    assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
-    assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
-
-
-@pytest.mark.parametrize(
-    ("nats", "reason", "node", "left", "added", "undecided"),
-    [
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED, True),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED + JUST, False),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0, NEEDED, False),
-        (30.0 + NEEDED, SIZE_NOT_DETERMINED, "n1", 9.0, 0.0, False),
-        (90.0, NO_FORESIGHT, "n1", 9.0, 0.0, False),
-        (90.0, SIZE_NOT_DETERMINED, "n0", 9.0, 0.0, False),
-    ],
-    ids=["explains it", "leaves some", "explains no less", "hardly likelier", "predicts nothing", "is the same"],
-)
-def test_a_name_that_adds_nothing_to_a_likelier_one_of_unknown_size_is_none(
-    monkeypatch: pytest.MonkeyPatch, nats: float, reason: str, node: str, left: float, added: float, undecided: bool
-) -> None:
-    """The other one leaves one noise variance, the finding more."""
-    weighed: list[tuple[Trial, Trial]] = []
-
-    def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-        weighed.append((simple, rich))
-        return Evidence(added, 0.0)
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", weigh)
-    found, option = kind_at("constant_heat_load", "n0", 30.0), kind_at("constant_heat_load", node, nats, reason)
-    option = replace(option, trial=stub(*option.effects, left=1.0))
-    state = Search(stub(*found.effects, left=left), stub(), findings=[Finding(found)])
-    assert is_undecided(state, [option], NEEDED) == undecided
-    for simple, rich in weighed:
-        assert simple is option.trial and [e.where["node"] for e in rich.effects] == [node, "n0"]
-
-
-@pytest.mark.parametrize(
-    ("nats", "alone", "reason", "leads"),
-    [
-        (60.0 + NEEDED + JUST, 60.0 + NEEDED + JUST, "", "boundary_mix"),
-        (60.0 + NEEDED, 99.0, "", "constant_heat_load"),
-        (90.0, 60.0 + NEEDED, "", "constant_heat_load"),
-        (90.0, 99.0, NO_FORESIGHT, "constant_heat_load"),
-    ],
-    ids=["likelier", "hardly likelier", "refitted hardly likelier", "predicts no better"],
-)
-def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
-    monkeypatch: pytest.MonkeyPatch, nats: float, alone: float, reason: str, leads: str
-) -> None:
-    """The finding that it takes the place of is among its alternatives then, and not refused."""
-    found, other = judged("a", 60.0), judged("b", 10.0)
-    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {"alpha": 0.5, "T_w_K": 280.0})
-    option = Judged((mix,), Evidence(nats, 0.0), stub(mix))
-    told = Finding(found, (option, other))
-    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 60.0))
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
-    state = Search(found.trial, stub(), findings=[Finding(found)])
-    tell_alternatives(state, NEEDED)
-    (finding,) = state.findings
-    assert [e.name for e in finding.effects] == [leads] == [e.name for e in state.trial.effects]
-    names = [a.effects[0].name for a in finding.alternatives]
-    assert names == (["constant_heat_load"] * 2 if leads == "boundary_mix" else ["boundary_mix", "constant_heat_load"])
-    assert state.rejected == []
-
-
-@pytest.mark.parametrize(
-    ("alone", "reason", "leads"),
-    [(NEEDED + JUST, "", "constant_heat_load"), (NEEDED, "", "boundary_mix"), (50.0, NO_LAW, "boundary_mix")],
-    ids=["supported", "not supported", "no law"],
-)
-def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
-    monkeypatch: pytest.MonkeyPatch, alone: float, reason: str, leads: str
-) -> None:
-    """Less likely by many nats, which say little where both explain as much: of the simple ones the likelier leads."""
-    mix = REGISTRY["boundary_mix"]({"boundary": "bus"}, {"alpha": 0.5, "T_w_K": 280.0})
-    found = Judged((mix,), Evidence(90.0, 0.0), stub(mix))
-    told = Finding(found, (judged("a", 60.0), judged("b", 10.0)))
-    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
-    state = Search(found.trial, stub(), findings=[Finding(found)])
-    tell_alternatives(state, NEEDED)
-    (finding,) = state.findings
-    assert [e.name for e in finding.effects] == [leads]
-    names = [a.effects[0].name for a in finding.alternatives]
-    assert names == (["boundary_mix", "constant_heat_load"] if leads != "boundary_mix" else ["constant_heat_load"] * 2)
-    if leads == "constant_heat_load":
-        assert finding.effects[0].where == {"node": "a"}
-
-
-@pytest.mark.parametrize(
-    ("left", "foresight", "leads"),
-    [(2.0 - JUST, 0.9 * FORESIGHT - JUST, "b"), (2.0 - JUST, 0.9 * FORESIGHT, "a"), (2.0, 0.1, "a")],
-    ids=["predicts better", "hardly better", "leaves as much"],
-)
-def test_of_names_alike_the_one_leads_that_leaves_less_and_predicts_better(
-    monkeypatch: pytest.MonkeyPatch, left: float, foresight: float, leads: str
-) -> None:
-    """However little the evidence speaks for it: where a network is coarse, nats say little."""
-    found = judged("a", 90.0)
-    option = judged("b", 40.0, left=left, foresight=foresight)
-    told = Finding(found, (option,))
-    trials = {"b": option.trial}
-    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: trials[effects[0].where["node"]])
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(40.0, 0.0))
-    monkeypatch.setattr(
-        revision, "examine", lambda simple, judged, needed: (replace(judged, validation=option.validation), False)
-    )
-    state = Search(stub(load("a"), left=2.0, foresight=0.9), stub(), findings=[Finding(found)])
-    tell_alternatives(state, NEEDED)
-    (finding,) = state.findings
-    assert [e.where["node"] for e in finding.effects] == [leads]
-    assert [a.effects[0].where["node"] for a in finding.alternatives] == [{"a": "b", "b": "a"}[leads]]
-
-
-def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
-    state = Search(stub(), stub())
-    option = judged("a", 90.0)
-    state.rejected = [replace(option, trial=stub(load("a"), load("b")), reason=SMALL_REMAINDER)]
-    reconsider(state, NEEDED)
-    assert not state.findings
 
 
 @given(st.floats(0.0, 1e6), st.floats(1.0, 2.0), st.integers(10, 10**7))

@@ -1,0 +1,19 @@
+"""Fixtures of the deciding rooms."""
+
+from typing import Any
+
+import pytest
+
+from twin_core.discover import coarseness, revision
+from twin_core.discover.confirm import Trial, Validation
+
+
+@pytest.fixture
+def foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a stub foretells is what it says."""
+
+    def told(simple: Trial, rich: Any) -> Validation:
+        return Validation(rich.foresight, 1.0, rich.foresight, 0.1, 1.0)
+
+    monkeypatch.setattr(coarseness, "validate", told)
+    monkeypatch.setattr(revision, "validate", told)

@@ -1,0 +1,78 @@
+"""Stubs of trials and findings of which only what decides counts."""
+
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+
+from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.judge import (
+    Judged,
+)
+from twin_core.discover.policy import (
+    LEAST_COARSENESS,
+    MOST_COARSENESS,
+    VISIBLE_COARSENESS,
+)
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect
+
+JUST = 1e-6
+
+
+NEEDED = 4.6
+
+
+LEAST, MOST = LEAST_COARSENESS, MOST_COARSENESS
+
+
+N_READINGS = 5000
+
+
+CHANCE = VISIBLE_COARSENESS * float(np.sqrt(2.0 / N_READINGS))
+
+
+@dataclass
+class Problem:
+    n_free: int
+
+
+@dataclass
+class Fit:
+    problem: Problem
+
+
+@dataclass
+class Stub:
+    """A trial of which only the excess and the number of its parameters count."""
+
+    effects: tuple[Effect, ...] = ()
+    left: float = 0.0
+    n_free: int = 3
+    n_samples: int = N_READINGS
+    foresight: float = 1.0
+    fit: Fit = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.fit = Fit(Problem(self.n_free))
+
+    def excess(self) -> Any:
+        return np.array([2.0 * self.left, 0.0])
+
+
+def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
+    return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))
+
+
+def load(node: str) -> Effect:
+    return REGISTRY["constant_heat_load"]({"node": node}, {"Q_W": 1.0})
+
+
+def unnamed() -> Effect:
+    """Return an effect that claims no law; of its kind alone counts."""
+    return cast(Effect, type("Free", (), {"fallback": True, "place": "n0", "label": "free(n0)"})())
+
+
+def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresight: float = 0.5) -> Judged:
+    validation = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
+    return Judged((load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free), validation)
