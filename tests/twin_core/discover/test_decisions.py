@@ -46,6 +46,7 @@ from twin_core.discover.policy import (
 )
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect
 
 pytestmark = pytest.mark.usefixtures("foreseen")
 
@@ -133,6 +134,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         ([judged("a", 90.0, foresight=0.99), judged("b", 60.0)], "b", [NO_FORESIGHT]),
         ([judged("a", 90.0), judged("b", 60.0)], "a", []),
         ([judged("form", 90.0), judged("b", 60.0)], None, [NO_LAW]),
+        ([judged("form", 90.0, left=1.0), judged("b", 60.0)], "b", [NO_LAW]),
         ([judged("form", 90.0), judged("b", 3.0)], None, [NO_LAW, NOT_SUPPORTED]),
         ([*(judged(f"x{i}", 90.0 - i) for i in range(5)), judged("b", 60.0)], "b", [LESS_LIKELY] * 5),
         ([*(judged(f"a{i}", 90.0 - i, foresight=1.0) for i in range(8)), judged("b", 60.0)], None, [NO_FORESIGHT] * 8),
@@ -145,6 +147,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         "the next",
         "the likeliest",
         "no law",
+        "explains more than what is no law",
         "nothing else",
         "what is seen at once costs nothing",
         "so many are validated",
@@ -338,6 +341,58 @@ def test_an_option_is_settled_that_may_become_likely(
     monkeypatch.setattr(trajectories, "weigh", lambda *arguments: Evidence(200.0, 0.0))
     found = trajectories._settled(Search(stub(), stub()), [option], 1, NEEDED)
     assert [j.trial for j in found] == ([settled] if is_settled else [])
+
+
+@pytest.mark.parametrize("n_together", [1, 2])
+def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.MonkeyPatch, n_together: int) -> None:
+    """Pairs grow from what trajectories suggest; single effects come from both."""
+    by_trajectory, by_filter = judged("a", 50.0), judged("b", 90.0)
+    asked: list[list[Judged]] = []
+
+    def accepted(state: Search, options: list[Judged], needed: float) -> bool:
+        asked.append(list(options))
+        return True
+
+    monkeypatch.setattr(trajectories, "_extended", lambda *arguments, fallback: [by_trajectory])
+    monkeypatch.setattr(trajectories, "_extended_near", lambda *arguments, fallback: [by_filter])
+    monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
+    monkeypatch.setattr(trajectories, "accept", accepted)
+    state = Search(stub(), stub(), n_named=5)
+    told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [stub()], n_together, fallback=False)
+    assert told and seeds == [by_trajectory.trial]
+    assert asked == [[by_filter, by_trajectory] if n_together == 1 else [by_trajectory]]
+
+
+@pytest.mark.parametrize(
+    ("beside", "pairs", "leads"),
+    [(3.0 - JUST, 0.1, "single"), (3.0, 0.1, "pair"), (3.0, 0.6, "single")],
+    ids=["leaves little", "predicts better", "predicts worse"],
+)
+def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
+    monkeypatch: pytest.MonkeyPatch, beside: float, pairs: float, leads: str
+) -> None:
+    def trial(*effects: Effect, misfit: float) -> Trial:
+        made = stub(*effects, left=9.0)
+        made.misfit_share = lambda: misfit  # type: ignore[method-assign]
+        return made
+
+    def look(
+        fork: Search, needed: float, seeds: list[Trial], n: int, *, fallback: bool, known: object
+    ) -> tuple[bool, list[Trial]]:
+        node, foresight = ("single", 0.5) if n == 1 else ("pair", pairs)
+        fork.trial = trial(load(node), misfit=beside)
+        fork.findings.append(Finding(replace(judged(node, 50.0, foresight=foresight), trial=fork.trial)))
+        return True, [fork.trial]
+
+    base = trial(misfit=20.0)
+    base.fit = cast(Any, None)  # type: ignore[misc]
+    monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
+    monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, []))
+    monkeypatch.setattr(searching, "_pairs_by_heat", lambda *arguments: False)
+    monkeypatch.setattr(searching, "extend_by_trajectory", look)
+    state = Search(base, base)
+    assert searching._extend(state, NEEDED, fallback=False)
+    assert [f.effects[0].where["node"] for f in state.findings] == [leads]
 
 
 @pytest.mark.parametrize(
