@@ -155,10 +155,10 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     widened = not state.findings or mean_excess(state.trial) > policy.WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
-    told, ranked = state.attempt(first, f"{what}, by what the filter leaves") or (False, [])
+    told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
     together = not (fallback or state.findings)  # what only pays off with another one is looked for once
     if together and not told:
-        told = bool(state.attempt(partial(_pairs_by_heat, by_heat, ranked, needed), f"{what}, two at a time"))
+        told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial
     if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
@@ -166,7 +166,9 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
 
     def look(fork: Search, seeds: Sequence[Trial], n_together: int) -> tuple[bool, list[Trial]]:
         known = by_heat.findings[-1].judged.places if told else ()
-        second = partial(extend_by_trajectory, fork, needed, seeds, n_together, fallback=fallback, known=known)
+        second = partial(
+            extend_by_trajectory, fork, needed, seeds, rankings[-1], n_together, fallback=fallback, known=known
+        )
         return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
 
     def leaves(trial: Trial) -> float:
@@ -199,8 +201,11 @@ def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
     return [min(singles, key=worth).trial] if singles else []
 
 
-def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bool, Sequence[Probe]]:
-    """Extend by the effect that innovations suggest beside undeclared heat; tell whether one holds, and how they rank."""
+def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bool, list[list[Probe]]]:
+    """Extend by the effect that innovations suggest beside undeclared heat; tell whether one holds, and how all rank.
+
+    There is one ranking for each size of the undeclared heat, the largest first.
+    """
     screenings = screened(state.trial, state.trial.fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
@@ -209,7 +214,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bo
         chosen = [probe.effect for probe in screenings[0].probes if probe.effect.place in some]  # of every degree
     else:
         chosen = refined(state.trial.fit, shortlist(rankings, needed, N_REFITS, state.first))
-    return _accept_settled(state, [(effect,) for effect in chosen], n_tried, needed), rankings[0]
+    return _accept_settled(state, [(effect,) for effect in chosen], n_tried, needed), rankings
 
 
 def _pairs_by_heat(state: Search, ranked: Sequence[Probe], needed: float) -> bool:

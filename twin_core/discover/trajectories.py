@@ -18,6 +18,7 @@ from twin_core.discover.confirm import (
     weigh,
 )
 from twin_core.discover.judge import Judged, Search, accept, once_each, worth
+from twin_core.discover.screen import Probe
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.effects.base import Effect, Place
 
@@ -42,6 +43,7 @@ def extend_by_trajectory(
     state: Search,
     needed: float,
     seeds: Sequence[Trial],
+    near: Sequence[Probe],
     n_together: int,
     *,
     fallback: bool,
@@ -57,6 +59,8 @@ def extend_by_trajectory(
         Log Bayes factor that is asked for.
     seeds
         Trials that are extended by one more effect: the model so far, or what may only pay off together with another.
+    near
+        Candidates about the measured temperatures, screened beside little heat, the best first.
     n_together
         Effects that are added to the model so far.
     fallback
@@ -71,8 +75,8 @@ def extend_by_trajectory(
     """
     judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
     # What the filter suggests beside little heat is no seed: it is far from where long trajectories point.
-    near = _extended_near(state, needed, fallback=fallback) if n_together == 1 else []
-    sets, best = once_each(judged)[:N_KEPT], once_each([*judged, *near])[:N_KEPT]
+    close = _extended_near(state, near, needed, fallback=fallback) if n_together == 1 else []
+    sets, best = once_each(judged)[:N_KEPT], once_each([*judged, *close])[:N_KEPT]
     if not best:
         return False, []
     options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
@@ -92,16 +96,13 @@ def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fal
     return _all_fitted(state, seed, effects, comb(n_tried, n_together))
 
 
-def _extended_near(state: Search, needed: float, *, fallback: bool) -> list[Judged]:
+def _extended_near(state: Search, near: Sequence[Probe], needed: float, *, fallback: bool) -> list[Judged]:
     """Return what effects make of the state's model that are screened about the measured temperatures, beside little heat.
 
     Where a model misses much, its own trajectories lie far from the measured ones, and what answers there is another effect.
     """
-    trial = state.trial
-    (screening,) = screened(trial, trial.fit, UNDECLARED_SHARES[-1:], fallback=fallback)
-    ranking = best_of_each_place(screening.probes, trial.n_samples)
-    effects = refined(trial.fit, shortlist([ranking], needed, N_NEAR))
-    return _all_fitted(state, trial, effects, state.count(len(ranking), fallback=fallback))
+    effects = refined(state.trial.fit, shortlist([near], needed, N_NEAR))
+    return _all_fitted(state, state.trial, effects, state.count(max(len(near), 1), fallback=fallback))
 
 
 def _all_fitted(state: Search, seed: Trial, effects: Sequence[Effect], n_tried: int) -> list[Judged]:

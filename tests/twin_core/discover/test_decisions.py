@@ -358,7 +358,7 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
     monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
     monkeypatch.setattr(trajectories, "accept", accepted)
     state = Search(stub(), stub(), n_named=5)
-    told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [stub()], n_together, fallback=False)
+    told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [stub()], [], n_together, fallback=False)
     assert told and seeds == [by_trajectory.trial]
     assert asked == [[by_filter, by_trajectory] if n_together == 1 else [by_trajectory]]
 
@@ -377,7 +377,7 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
         return made
 
     def look(
-        fork: Search, needed: float, seeds: list[Trial], n: int, *, fallback: bool, known: object
+        fork: Search, needed: float, seeds: list[Trial], near: object, n: int, *, fallback: bool, known: object
     ) -> tuple[bool, list[Trial]]:
         node, foresight = ("single", 0.5) if n == 1 else ("pair", pairs)
         fork.trial = trial(load(node), misfit=beside)
@@ -387,7 +387,7 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
     base = trial(misfit=20.0)
     base.fit = cast(Any, None)  # type: ignore[misc]
     monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
-    monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, []))
+    monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, [[]]))
     monkeypatch.setattr(searching, "_pairs_by_heat", lambda *arguments: False)
     monkeypatch.setattr(searching, "extend_by_trajectory", look)
     state = Search(base, base)
