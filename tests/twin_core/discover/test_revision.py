@@ -57,6 +57,8 @@ def test_what_foretells_has_less_to_explain(monkeypatch: pytest.MonkeyPatch, for
         state = Search(rich, simple, findings=[Finding(judged("n0", 50.0))])
         withdraw(state, NEEDED)
         assert bool(state.findings) == kept
+    beside = stub(load("n1"), left=0.5 + DOMINANCE * LEAST - JUST)
+    assert not stands(beside, stub(load("n1"), load("n0"), left=0.5, foresight=foresight))
 
 
 @pytest.mark.parametrize(
