@@ -31,7 +31,7 @@ SHORTER_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 to which the other parameters give way; where a fit starts they have not yet."""
 
 MOST_ROUNDS = 8
-"""So often a fit is taken up again until it has converged."""
+"""So often a fit is taken up again until it has converged, a limit of time: declared records took two rounds at most."""
 
 CONSIDERABLE = 0.1
 """Nodes whose undeclared heat moves them less than this share of the most moved one say nothing about an effect."""

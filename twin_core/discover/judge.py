@@ -23,7 +23,7 @@ from twin_core.simulate.rollout import hurried
 T = TypeVar("T")
 
 N_VALIDATED = 8
-"""Options that are validated at most."""
+"""Options that are validated at most, a limit of time: a right one has been the seventh likeliest in a coarse network."""
 
 Without = tuple[Trial, float]
 """A trial without some of its effects, and their log Bayes factor."""
@@ -194,8 +194,12 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
         n_validated = sum(j.validation is not None for j in refused) + len(passed)
         if best.evidence.log_bayes_factor <= needed or n_validated >= N_VALIDATED:
             continue
-        if any(mean_excess(best.trial) >= mean_excess(trial) for trial in unlike):
-            continue  # what explains less is no better a name for this heat
+        if unlike:
+            left = state.attempt(partial(mean_excess, best.trial), best.labels)
+            if left is None:
+                refused.append(replace(best, reason=NOT_EXAMINED))
+            if left is None or any(left >= mean_excess(trial) for trial in unlike):
+                continue  # what explains less is no better a name for this heat
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         if own.reason:

@@ -287,12 +287,11 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
     better = [(j, -np.inf, np.inf) for j in sorted(simplest, key=worth)]
     if finding.judged in simplest:
         likelier = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed]
-        left = mean_excess(state.trial)
-        less = [j for j in simplest if j is not finding.judged and mean_excess(j.trial) < left]
         better = [(j, needed, np.inf) for j in sorted(likelier, key=worth)]
-        better += [
-            (j, -np.inf, policy.FORESIGHT) for j in sorted(less, key=lambda j: mean_excess(j.trial))[:N_EXCHANGED]
-        ]
+        asked = ((j, state.attempt(partial(mean_excess, j.trial), j.labels)) for j in simplest)
+        left = [(value, j) for j, value in asked if value is not None]
+        less = [(value, j) for value, j in left if j is not finding.judged and value < mean_excess(state.trial)]
+        better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
     for best, margin, foresight in better:
         replaced = partial(_in_place_of, state, finding, best, needed, margin, foresight)
         if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):

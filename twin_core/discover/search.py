@@ -177,7 +177,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_pairs, paired = state.fork(), False
     misfit = leaves(state.trial)
     seen, sets = look(by_trajectory, [state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
-    if together and sets and misfit >= TOGETHER_MISFIT_SHARE <= (leaves(by_trajectory.trial) if seen else np.inf):
+    least = min(misfit, leaves(by_trajectory.trial)) if seen else misfit
+    if together and sets and least >= TOGETHER_MISFIT_SHARE:
         beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
         paired, _ = look(by_pairs, [*sets, *beside], 2)
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen), (by_pairs, paired)) if found]

@@ -26,7 +26,8 @@ N_REFITS, N_NEAR = 6, 9
 """Effects that are fitted on trajectories: suggested by what these leave, and by what the filter leaves beside little heat."""
 
 TOGETHER_MISFIT_SHARE = 3.0
-"""Misfit over noise above which two effects are tried together where none helps alone: more fit anything on a long trajectory."""
+"""Misfit over noise from which two effects are tried together, if no single one brings it below: more fit anything on a long
+trajectory."""
 
 LEAST_MISFIT_SHARE = 0.3
 """Misfit over noise below which trajectories have nothing to add to the innovations."""

@@ -21,6 +21,7 @@ from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
+    NOT_EXAMINED,
     NOT_SUPPORTED,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
@@ -158,6 +159,22 @@ def test_what_is_accepted(options: list[Judged], named: str | None, reasons: lis
     assert accept(state, options, NEEDED) == (named is not None)
     assert [f.effects[0].where["node"] for f in state.findings] == ([] if named is None else [named])
     assert [j.reason for j in state.rejected] == reasons
+
+
+@pytest.mark.usefixtures("examined")
+def test_an_option_that_cannot_be_computed_ends_no_choice() -> None:
+    """Not even where what it leaves is compared with what a name left that is no law."""
+
+    def fails() -> Any:
+        raise np.linalg.LinAlgError("no number")
+
+    option = judged("b", 60.0)
+    option.trial.excess = fails  # type: ignore[method-assign]
+    state = Search(stub(left=9.0), stub(left=9.0))
+    accept(state, [judged("form", 90.0, left=1.0), option, judged("c", 50.0)], NEEDED)
+    assert any("no number" in reason for reason in state.failures)
+    assert [j.reason for j in state.rejected] == [NO_LAW, NOT_EXAMINED]
+    assert [f.effects[0].where["node"] for f in state.findings] == ["c"]
 
 
 @pytest.mark.usefixtures("examined")
