@@ -12,7 +12,7 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
-from twin_core.discover.coarseness import stands
+from twin_core.discover.coarseness import by_chance, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import Repeatable, acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
 from twin_core.discover.wald import least_wald_score, score_needed
@@ -198,8 +198,9 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             left = state.attempt(partial(mean_excess, best.trial), best.labels)
             if left is None:
                 refused.append(replace(best, reason=NOT_EXAMINED))
-            if left is None or any(left >= mean_excess(trial) for trial in unlike):
-                continue  # what explains less is no better a name for this heat
+            more_than_chance = by_chance(best.trial.n_samples)
+            if left is None or any(left + more_than_chance >= mean_excess(trial) for trial in unlike):
+                continue  # what explains no more is no better a name for this heat
         examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
         own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
         if own.reason:
