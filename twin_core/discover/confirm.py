@@ -360,6 +360,12 @@ def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> E
     return _evidence(after - simple.log_evidence(), simple, rich, n_tried)
 
 
+def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+    """Return what the readings say for the rich trial where all that nobody declared wanders at the sensors, not at the nodes."""
+    gain = rich.calibration().log_posterior - simple.calibration().log_posterior
+    return _evidence(gain, simple, rich, n_tried)
+
+
 def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return evidence from a gain in log-likelihood: every parameter and every candidate tried is paid for."""
     extra = max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)

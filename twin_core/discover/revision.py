@@ -11,10 +11,19 @@ import numpy as np
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import by_chance, foretold, least_explained
-from twin_core.discover.confirm import Trial, mean_excess, try_effects, validate, weigh
+from twin_core.discover.confirm import (
+    Trial,
+    mean_excess,
+    resettled,
+    try_effects,
+    validate,
+    weigh,
+    weigh_trajectories,
+)
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_MORE,
+    NOT_SUPPORTED,
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
@@ -24,6 +33,7 @@ from twin_core.discover.judge import (
     Without,
     examine,
     foresight_of,
+    once_each,
     worth,
 )
 from twin_core.effects.base import Effect, touched_nodes
@@ -247,6 +257,42 @@ def reconsider(state: Search, needed: float) -> None:
             instead.rejected += [replace(f.judged, reason=OUTDONE) for f in named]
             state.join(instead)
             return
+
+
+def name_what_foretells(state: Search, needed: float) -> None:
+    """Name a single effect that foretells where nothing is supported, and tell beside it those that explain as much.
+
+    Heat that wanders stands for whatever lasts a while, such as a load that came on half-way: where a coarse network makes it
+    large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off. There it is
+    weighed by trajectories alone, and must leave less of the error on what it was not fitted to than one part in ``DOMINANCE``:
+    no name does on healthy finite elements.
+    """
+    if state.findings or state.left_out:
+        return
+    weak = [j for j in state.rejected if j.reason == NOT_SUPPORTED and not any(e.fallback for e in j.effects)]
+    single = [j for j in weak if len(j.effects) == len(j.trial.effects) == 1]
+
+    def weighed(option: Judged) -> Judged:
+        evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))
+        return replace(option, evidence=evidence, reason="")
+
+    def examined(option: Judged) -> Judged:
+        settled = resettled(state.base, option.trial)
+        return examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
+
+    asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
+    likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
+    seen = [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]]
+    passed = [j for j in seen if j and not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
+    if not passed:
+        return
+    explained = {j.places: mean_excess(state.base) - mean_excess(j.trial) for j in passed}
+    least = (1.0 - policy.REPEATABLE_SHARE) * max(explained.values())
+    best, *others = sorted((j for j in passed if explained[j.places] >= least), key=foresight_of)
+    state.trial, state.findings = best.trial, [Finding(best, tuple(others))]
+    named = {j.places for j in (best, *others)}
+    state.rejected = [j for j in state.rejected if j.places not in named]
+    withdraw(state, needed)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

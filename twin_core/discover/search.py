@@ -30,7 +30,15 @@ from twin_core.discover.judge import (
     threshold,
     worth,
 )
-from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import (
+    exchange,
+    is_undecided,
+    name_what_foretells,
+    prune,
+    reconsider,
+    tell_alternatives,
+    withdraw,
+)
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import (
@@ -123,6 +131,7 @@ def search(
         if _places(state) == known:
             break  # what was found does not hold: the next step would find it again
     withdraw(state, needed)
+    name_what_foretells(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         with state.until(looking):

@@ -25,6 +25,7 @@ from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
+    NOT_SUPPORTED,
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
@@ -38,7 +39,15 @@ from twin_core.discover.policy import (
     LEAST_EXCESS,
     THRESHOLDS,
 )
-from twin_core.discover.revision import exchange, is_undecided, prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import (
+    exchange,
+    is_undecided,
+    name_what_foretells,
+    prune,
+    reconsider,
+    tell_alternatives,
+    withdraw,
+)
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 
@@ -316,6 +325,83 @@ def test_what_stands_in_part_only_gives_way_to_what_stands_whole(monkeypatch: py
     reconsider(state, NEEDED)
     assert [e.where["node"] for f in state.findings for e in f.effects] == ["c"]
     assert pair in state.rejected and single not in state.rejected
+
+
+JUST_FORETELLS = 1.0 / DOMINANCE - JUST
+
+
+@pytest.mark.parametrize(
+    ("options", "nats", "names", "others"),
+    [
+        ([judged("a", -90.0, foresight=JUST_FORETELLS)], {"a": 200.0}, ["a"], []),
+        ([judged("a", -90.0, foresight=1.0 / DOMINANCE)], {"a": 200.0}, [], []),
+        ([judged("a", -90.0, foresight=0.1)], {"a": NEEDED}, [], []),
+        ([judged("no law", -90.0, foresight=0.1)], {"no law": 200.0}, [], []),
+        ([judged("a", -9.0, foresight=0.3), judged("b", -9.0, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], ["a"]),
+        ([judged("a", -9.0), judged("b", -9.0, left=4.0, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], []),
+        (
+            [judged("a", -9.0, foresight=0.3), judged("b", -9.0, left=5.0 + JUST, foresight=0.2)],
+            {"a": 9.0, "b": 8.0},
+            ["a"],
+            [],
+        ),
+        ([replace(judged("a", -9.0, foresight=0.1), effects=(unnamed(),))], {}, [], []),
+        ([replace(judged("a", 9.0, foresight=0.1), reason=NO_MORE)], {"a": 9.0}, [], []),
+    ],
+    ids=[
+        "foretells",
+        "not enough",
+        "trajectories hardly likelier",
+        "no law",
+        "explains as much and foretells better",
+        "foretells what a likelier one does not",
+        "explains less, so is no alternative",
+        "has no name",
+        "was refused for something else",
+    ],
+)
+def test_what_foretells_is_named_where_wandering_heat_is_as_likely(
+    monkeypatch: pytest.MonkeyPatch, options: list[Judged], nats: dict[str, float], names: list[str], others: list[str]
+) -> None:
+    """The declared model leaves fifty noise variances; of as much as 45 explained, five are a tenth."""
+
+    def node(trial: Trial) -> str:
+        return str(trial.effects[0].where["node"])
+
+    monkeypatch.setattr(revision, "weigh_trajectories", lambda simple, rich, n: Evidence(nats[node(rich)], 0.0))
+    monkeypatch.setattr(revision, "resettled", lambda simple, rich: rich)
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(
+        revision,
+        "examine",
+        lambda simple, option, needed: (
+            replace(option, reason=NO_LAW if node(option.trial) == "no law" else ""),
+            False,
+        ),
+    )
+    state = Search(stub(left=50.0), stub(left=50.0))
+    state.rejected = [replace(j, reason=j.reason or NOT_SUPPORTED) for j in options]
+    before = list(state.rejected)
+    name_what_foretells(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == names
+    assert [j.effects[0].where["node"] for f in state.findings for j in f.alternatives] == others
+    told = {*names, *others}
+    assert state.rejected == [j for j in before if j.effects[0].fallback or j.effects[0].where["node"] not in told]
+    assert [e.where["node"] for e in state.trial.effects] == names
+
+
+def test_nothing_is_named_for_its_foresight_beside_a_finding_or_where_time_ran_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(revision, "weigh_trajectories", lambda *_: pytest.fail("nobody should ask"))
+    weak = replace(judged("a", -9.0, foresight=0.1), reason=NOT_SUPPORTED)
+    found = Finding(judged("f", 9.0))
+    for state in (
+        Search(stub(), stub(), findings=[found], rejected=[weak]),
+        Search(stub(), stub(), left_out=["b"], rejected=[weak]),
+    ):
+        name_what_foretells(state, NEEDED)
+        assert state.rejected == [weak]
 
 
 def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
