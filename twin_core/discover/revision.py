@@ -264,8 +264,8 @@ def name_what_foretells(state: Search, needed: float) -> None:
 
     Heat that wanders stands for whatever lasts a while, such as a load that came on half-way: where a coarse network makes it
     large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off. There it is
-    weighed by trajectories alone, and must leave less of the error on what it was not fitted to than one part in ``DOMINANCE``:
-    no name does on healthy finite elements.
+    weighed by trajectories alone, must leave less of the error on what it was not fitted to than one part in ``DOMINANCE`` (no
+    name does on healthy finite elements), and no more misfit than a coarse network may.
     """
     if state.findings or state.left_out:
         return
@@ -283,7 +283,8 @@ def name_what_foretells(state: Search, needed: float) -> None:
     asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
     likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
     seen = [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]]
-    passed = [j for j in seen if j and not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
+    foretell = [j for j in seen if j and not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
+    passed = [j for j in foretell if mean_excess(j.trial) <= policy.MOST_COARSENESS]
     if not passed:
         return
     explained = {j.places: mean_excess(state.base) - mean_excess(j.trial) for j in passed}

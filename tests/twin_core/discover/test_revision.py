@@ -338,9 +338,10 @@ JUST_FORETELLS = 1.0 / DOMINANCE - JUST
         ([judged("a", -90.0, foresight=0.1)], {"a": NEEDED}, [], []),
         ([judged("no law", -90.0, foresight=0.1)], {"no law": 200.0}, [], []),
         ([judged("a", -9.0, foresight=0.3), judged("b", -9.0, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], ["a"]),
-        ([judged("a", -9.0), judged("b", -9.0, left=4.0, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], []),
+        ([judged("a", -9.0), judged("b", -9.0, left=MOST, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], []),
+        ([judged("a", -9.0, left=MOST + JUST, foresight=0.1)], {"a": 200.0}, [], []),
         (
-            [judged("a", -9.0, foresight=0.3), judged("b", -9.0, left=5.0 + JUST, foresight=0.2)],
+            [judged("a", -9.0, foresight=0.3), judged("b", -9.0, left=3.0 + JUST, foresight=0.2)],
             {"a": 9.0, "b": 8.0},
             ["a"],
             [],
@@ -355,6 +356,7 @@ JUST_FORETELLS = 1.0 / DOMINANCE - JUST
         "no law",
         "explains as much and foretells better",
         "foretells what a likelier one does not",
+        "leaves more than coarseness",
         "explains less, so is no alternative",
         "has no name",
         "was refused for something else",
@@ -363,7 +365,7 @@ JUST_FORETELLS = 1.0 / DOMINANCE - JUST
 def test_what_foretells_is_named_where_wandering_heat_is_as_likely(
     monkeypatch: pytest.MonkeyPatch, options: list[Judged], nats: dict[str, float], names: list[str], others: list[str]
 ) -> None:
-    """The declared model leaves fifty noise variances; of as much as 45 explained, five are a tenth."""
+    """The declared model leaves thirty noise variances, of which three are a tenth."""
 
     def node(trial: Trial) -> str:
         return str(trial.effects[0].where["node"])
@@ -379,7 +381,7 @@ def test_what_foretells_is_named_where_wandering_heat_is_as_likely(
             False,
         ),
     )
-    state = Search(stub(left=50.0), stub(left=50.0))
+    state = Search(stub(left=30.0), stub(left=30.0))
     state.rejected = [replace(j, reason=j.reason or NOT_SUPPORTED) for j in options]
     before = list(state.rejected)
     name_what_foretells(state, NEEDED)
