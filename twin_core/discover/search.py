@@ -131,12 +131,12 @@ def search(
         if _places(state) == known:
             break  # what was found does not hold: the next step would find it again
     withdraw(state, needed)
-    name_what_foretells(state, needed)
     if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         with state.until(looking):
             _extend(state, needed, fallback=True)
         withdraw(state, needed)
+    name_what_foretells(state, needed)
     reconsider(state, needed)
     progress(0.95, "comparing what was found with other names")
     tell_alternatives(state, needed)
