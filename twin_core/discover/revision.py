@@ -276,20 +276,21 @@ def name_what_foretells(state: Search, needed: float) -> None:
         evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))
         return replace(option, evidence=evidence, reason="")
 
-    def examined(option: Judged) -> Judged:
+    def examined(option: Judged) -> tuple[Judged, float]:
         settled = resettled(state.base, option.trial)
-        return examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
+        told = examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
+        return told, mean_excess(settled)
 
     asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
     likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
-    seen = [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]]
-    foretell = [j for j in seen if j and not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
-    passed = [j for j in foretell if mean_excess(j.trial) <= policy.MOST_COARSENESS]
-    if not passed:
+    seen = filter(None, [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]])
+    told = [(j, left) for j, left in seen if not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
+    left_by = {j.places: left for j, left in told if left <= policy.MOST_COARSENESS}
+    if not left_by:
         return
-    explained = {j.places: mean_excess(state.base) - mean_excess(j.trial) for j in passed}
-    least = (1.0 - policy.REPEATABLE_SHARE) * max(explained.values())
-    best, *others = sorted((j for j in passed if explained[j.places] >= least), key=foresight_of)
+    share, least = policy.REPEATABLE_SHARE, min(left_by.values())
+    most = least + share * (mean_excess(state.base) - least)
+    best, *others = sorted((j for j, _ in told if left_by.get(j.places, np.inf) <= most), key=foresight_of)
     state.trial, state.findings = best.trial, [Finding(best, tuple(others))]
     named = {j.places for j in (best, *others)}
     state.rejected = [j for j in state.rejected if j.places not in named]
