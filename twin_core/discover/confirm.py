@@ -302,10 +302,13 @@ class Evidence:
         Difference of log evidence (Schwarz), the number of candidates tried counted against it.
     p_value
         Likelihood-ratio test, corrected for the number of candidates (Bonferroni).
+    along_trajectories
+        Whether of open-loop trajectories alone: all that nobody declared then wanders at the sensors.
     """
 
     log_bayes_factor: float
     p_value: float
+    along_trajectories: bool = False
 
 
 @dataclass(frozen=True)
@@ -363,7 +366,7 @@ def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> E
 def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return what the readings say for the rich trial where all that nobody declared wanders at the sensors, not at the nodes."""
     gain = rich.calibration().log_posterior - simple.calibration().log_posterior
-    return _evidence(gain, simple, rich, n_tried)
+    return replace(_evidence(gain, simple, rich, n_tried), along_trajectories=True)
 
 
 def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:

@@ -260,17 +260,24 @@ def reconsider(state: Search, needed: float) -> None:
 
 
 def name_what_foretells(state: Search, needed: float) -> None:
-    """Name a single effect that foretells where nothing is supported, and tell beside it those that explain as much.
+    """Name a single effect that foretells what nothing that was found does, and tell beside it those that explain as much.
 
     Heat that wanders stands for whatever lasts a while, such as a load that came on half-way: where a coarse network makes it
-    large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off. There it is
-    weighed by trajectories alone, must leave less of the error on what it was not fitted to than one part in ``DOMINANCE`` (no
-    name does on healthy finite elements), and no more misfit than a coarse network may.
+    large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off; or it tells
+    another one that explains a part of it. There it is weighed by trajectories alone, must leave less of the error on what it
+    was not fitted to than one part in ``DOMINANCE`` of what the declared model leaves, or the names that were found (no name
+    does on most healthy finite elements), and no more misfit than these or a coarse network may.
     """
-    if state.findings or state.left_out:
+    if state.left_out or any(effect.fallback for finding in state.findings for effect in finding.effects):
         return
     weak = [j for j in state.rejected if j.reason == NOT_SUPPORTED and not any(e.fallback for e in j.effects)]
     single = [j for j in weak if len(j.effects) == len(j.trial.effects) == 1]
+    if not single:
+        return
+
+    def found() -> tuple[float, float]:
+        foresight = validate(state.base, state.trial).foresight if state.findings else 1.0
+        return foresight, min(mean_excess(state.trial), policy.MOST_COARSENESS)
 
     def weighed(option: Judged) -> Judged:
         evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))
@@ -281,16 +288,21 @@ def name_what_foretells(state: Search, needed: float) -> None:
         told = examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
         return told, mean_excess(settled)
 
+    so_far = state.attempt(found, "what was found foretells")
+    if so_far is None:
+        return
+    foresight, most_left = so_far
     asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
     likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
     seen = filter(None, [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]])
-    told = [(j, left) for j, left in seen if not j.reason and policy.DOMINANCE * foresight_of(j) < 1.0]
-    left_by = {j.places: left for j, left in told if left <= policy.MOST_COARSENESS}
+    told = [(j, left) for j, left in seen if not j.reason and policy.DOMINANCE * foresight_of(j) < foresight]
+    left_by = {j.places: left for j, left in told if left <= most_left}
     if not left_by:
         return
     share, least = policy.REPEATABLE_SHARE, min(left_by.values())
     most = least + share * (mean_excess(state.base) - least)
     best, *others = sorted((j for j, _ in told if left_by.get(j.places, np.inf) <= most), key=foresight_of)
+    state.rejected += [replace(finding.judged, reason=OUTDONE) for finding in state.findings]
     state.trial, state.findings = best.trial, [Finding(best, tuple(others))]
     named = {j.places for j in (best, *others)}
     state.rejected = [j for j in state.rejected if j.places not in named]

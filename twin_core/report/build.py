@@ -178,6 +178,16 @@ def _thinned(search: Search) -> list[str]:
     return [f"the record is long: effects were searched on {share}; both models were calibrated on all of them"]
 
 
+def _along_trajectories(search: Search) -> list[str]:
+    """Say which findings open-loop trajectories alone support, so that their evidence is not compared with that of others."""
+    return [
+        f"{finding.judged.labels} is supported by open-loop trajectories alone: beside heat that wanders at the nodes the "
+        "readings do not tell it, and its log Bayes factor is larger than one that allows for such heat"
+        for finding in search.findings
+        if finding.judged.evidence.along_trajectories
+    ]
+
+
 def unexplained_share(calibration: Calibration) -> float:
     """Return the part of the open-loop residuals' variance over the training part that is beyond the sensors' noise."""
     scaled = np.concatenate(calibration.residuals) / calibration.problem.noise_K
@@ -259,6 +269,7 @@ def build_report(
         "words": after.summary["words"],
         "notices": [
             *_doubts(search, scores),
+            *_along_trajectories(search),
             *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),

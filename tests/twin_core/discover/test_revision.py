@@ -392,14 +392,41 @@ def test_what_foretells_is_named_where_wandering_heat_is_as_likely(
     assert [e.where["node"] for e in state.trial.effects] == names
 
 
-def test_nothing_is_named_for_its_foresight_beside_a_finding_or_where_time_ran_out(
+@pytest.mark.parametrize(
+    ("foresight", "left", "replaced"),
+    [
+        (0.35 - JUST, 1.0, True),
+        (0.35, 1.0, False),
+        (0.1, 1.0 + JUST, False),
+    ],
+    ids=["leaves half the error", "no more than a finding's", "leaves more than the finding"],
+)
+def test_what_foretells_replaces_names_that_do_not(
+    monkeypatch: pytest.MonkeyPatch, foresight: float, left: float, replaced: bool
+) -> None:
+    """The finding leaves 0.7 of the error on what it was not fitted to, and one noise variance."""
+    monkeypatch.setattr(revision, "weigh_trajectories", lambda simple, rich, n: Evidence(200.0, 0.0))
+    monkeypatch.setattr(revision, "resettled", lambda simple, rich: rich)
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, option, needed: (option, False))
+    found = judged("f", 90.0)
+    option = judged("a", -90.0, left=left, foresight=foresight)
+    state = Search(stub(load("f"), left=1.0, foresight=0.7), stub(left=30.0), findings=[Finding(found)])
+    state.rejected = [replace(option, reason=NOT_SUPPORTED)]
+    name_what_foretells(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == (["a"] if replaced else ["f"])
+    assert [e.where["node"] for e in state.trial.effects] == (["a"] if replaced else ["f"])
+    assert [j.reason for j in state.rejected] == ([OUTDONE] if replaced else [NOT_SUPPORTED])
+
+
+def test_nothing_is_named_for_its_foresight_beside_heat_without_a_name_or_where_time_ran_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(revision, "weigh_trajectories", lambda *_: pytest.fail("nobody should ask"))
     weak = replace(judged("a", -9.0, foresight=0.1), reason=NOT_SUPPORTED)
-    found = Finding(judged("f", 9.0))
+    free = Finding(replace(judged("f", 9.0), effects=(unnamed(),)))
     for state in (
-        Search(stub(), stub(), findings=[found], rejected=[weak]),
+        Search(stub(), stub(), findings=[free], rejected=[weak]),
         Search(stub(), stub(), left_out=["b"], rejected=[weak]),
     ):
         name_what_foretells(state, NEEDED)

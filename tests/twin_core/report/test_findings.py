@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from twin_core.discover.confirm import Evidence
-from twin_core.discover.judge import Finding, Judged
+from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects import effect_from_json
 from twin_core.effects.base import Effect
 from twin_core.report import build
@@ -30,3 +30,14 @@ def test_what_an_alternative_has_as_well_is_not_in_doubt(monkeypatch: pytest.Mon
     told = {row["effect"]: row["alternatives"] for row in build.findings_json([Finding(pair, (option,))], model, [])}
     assert told["leak_to_boundary"] == []
     assert told["constant_heat_load"] == [{"effect": "sensor_lag", "where": {"sensor": "T_b"}, "log_bayes_factor": 8.0}]
+
+
+def test_what_trajectories_alone_support_is_said() -> None:
+    """Their evidence is larger than one that allows for heat that wanders at the nodes, so nobody may compare the two."""
+    heat = effect("constant_heat_load", {"node": "b"}, {"Q_W": 2.0})
+    trial: Any = None
+    told = Finding(Judged((heat,), Evidence(9.0, 0.0), trial))
+    alone = Finding(Judged((heat,), Evidence(900.0, 0.0, along_trajectories=True), trial))
+    assert build._along_trajectories(Search(trial, trial, findings=[told])) == []
+    (notice,) = build._along_trajectories(Search(trial, trial, findings=[told, alone]))
+    assert "constant_heat_load(b)" in notice and "trajectories alone" in notice
