@@ -29,24 +29,34 @@ def least_explained(beside: float, left: float, n_readings: int) -> float:
     return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
 
 
-def foretold(simple: Trial, rich: Trial) -> float:
-    """Return how much of what is asked of names remains where they foretell what they were not fitted to.
+def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = True) -> float:
+    """Return how many times as much as is asked of them names explain: so much of it as they foretell.
 
-    Coarseness is explained where it was seen; what is really there is foretold. Names that leave less of the variance of that
-    error than coarseness could, half of it for a dominance of two, have so much less to explain. Only where nothing else is
-    named: on healthy finite elements no name foretells so well, but what a name leaves beside it is foretold by others. What
-    cannot be computed is not foretold.
+    Coarseness is explained where it was seen; what is really there is foretold. With a share f² of the variance of what they were
+    not fitted to left over, names count as explaining no more than 1 - f² of all that was there. Those that leave less than
+    coarseness could, half of it for a dominance of two, have so much less to explain. Only where nothing else is named: what a
+    name leaves beside it is foretold by others. What cannot be computed counts by what it explains.
+
+    Parameters
+    ----------
+    simple, rich
+        Trials without the names and with them.
+    asked
+        Variance that they must explain, in units of the sensors' noise.
+    is_named
+        Whether names were added: a heat without a name counts by what it explains.
     """
-    if simple.effects:
-        return 1.0
-    told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", [])
-    return 1.0 if told is None else min(1.0, policy.DOMINANCE * told**2)
+    there = mean_excess(simple)
+    explained = there - mean_excess(rich)
+    alone = is_named and not simple.effects
+    told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
+    if told is not None:
+        explained = min(explained, (1.0 - told**2) * (1.0 + there))
+        asked *= min(1.0, policy.DOMINANCE * told**2)
+    return explained / asked if asked > 0.0 else np.inf
 
 
 def stands(simple: Trial, rich: Trial) -> bool:
     """Return whether what was added explains so much more than what stays beside it that it would not be withdrawn."""
     left, n_readings = mean_excess(rich), rich.n_samples
-    if left <= by_chance(n_readings):
-        return True
-    explained, asked = mean_excess(simple) - left, least_explained(left, left, n_readings)
-    return explained >= asked or explained >= asked * foretold(simple, rich)
+    return left <= by_chance(n_readings) or times_asked(simple, rich, least_explained(left, left, n_readings)) >= 1.0

@@ -10,7 +10,7 @@ import numpy as np
 
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.coarseness import by_chance, foretold, least_explained
+from twin_core.discover.coarseness import by_chance, least_explained, times_asked
 from twin_core.discover.confirm import (
     Trial,
     mean_excess,
@@ -65,7 +65,7 @@ def withdraw(state: Search, needed: float) -> None:
         without = _without_each(state, asked)
         named = {f.judged.places for f in state.findings if not all(effect.fallback for effect in f.effects)}
         told = {
-            places: _told(kept[0], state.trial, asked[places], is_named=places in named)
+            places: times_asked(kept[0], state.trial, asked[places], is_named=places in named)
             for places, kept in without.items()
             if kept
         }
@@ -83,14 +83,6 @@ def withdraw(state: Search, needed: float) -> None:
         _drop(state, weakest, *kept)
         for rest in filter(None, rests):
             _examine_again(state, rest, needed)
-
-
-def _told(without: Trial, trial: Trial, asked: float, *, is_named: bool) -> float:
-    """Return how many times what is asked of them effects explain; names that foretell have less to explain."""
-    explained = mean_excess(without) - mean_excess(trial)
-    if is_named and explained < asked:
-        asked *= foretold(without, trial)
-    return explained / asked if asked > 0.0 else np.inf
 
 
 def _examine_again(state: Search, places: Collection[object], needed: float, *, foresight: float = -np.inf) -> None:
@@ -275,9 +267,12 @@ def name_what_foretells(state: Search, needed: float) -> None:
     if not single:
         return
 
-    def found() -> tuple[float, float]:
+    def found() -> tuple[float, float] | None:
+        left = mean_excess(state.trial)
+        if left <= by_chance(state.trial.n_samples):
+            return None  # nothing is missing beside it
         foresight = validate(state.base, state.trial).foresight if state.findings else 1.0
-        return foresight, min(mean_excess(state.trial), policy.MOST_COARSENESS)
+        return foresight, min(left, policy.MOST_COARSENESS)
 
     def weighed(option: Judged) -> Judged:
         evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))

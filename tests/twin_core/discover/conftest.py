@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from twin_core.discover import coarseness, revision
@@ -10,9 +11,11 @@ from twin_core.discover.confirm import Trial, Validation
 
 @pytest.fixture
 def foreseen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a stub foretells is what it says."""
+    """What a stub foretells is what it says, if it says anything."""
 
     def told(simple: Trial, rich: Any) -> Validation:
+        if rich.foresight is None:
+            raise np.linalg.LinAlgError("it does not say")
         return Validation(rich.foresight, 1.0, rich.foresight, 0.1, 1.0)
 
     monkeypatch.setattr(coarseness, "validate", told)

@@ -211,12 +211,12 @@ def test_open_loop_residuals_are_asked_too_where_a_name_would_be_withdrawn(
     assert stands(stub(left=before), stub(load("n0"), left=left)) == kept
 
 
-def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_foresight_cannot_be_computed_a_name_counts_by_what_it_explains(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(simple: Trial, rich: Trial) -> Validation:
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(coarseness, "validate", fails)
-    assert coarseness.foretold(stub(), stub(load("n0"))) == 1.0
+    assert coarseness.times_asked(stub(left=9.0), stub(load("n0"), left=3.0), 4.0) == 1.5
 
 
 SCORE = score_needed(NEEDED)
