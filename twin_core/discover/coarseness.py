@@ -30,12 +30,12 @@ def least_explained(beside: float, left: float, n_readings: int) -> float:
 
 
 def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = True) -> float:
-    """Return how many times as much as is asked of them names explain: so much of it as they foretell.
+    """Return how many times as much as is asked of them names explain; those that foretell have less to explain.
 
-    Coarseness is explained where it was seen; what is really there is foretold. With a share f² of the variance of what they were
-    not fitted to left over, names count as explaining no more than 1 - f² of all that was there. Those that leave less than
-    coarseness could, half of it for a dominance of two, have so much less to explain. Only where nothing else is named: what a
-    name leaves beside it is foretold by others. What cannot be computed counts by what it explains.
+    Coarseness is explained where it was seen; what is really there is foretold. Names that leave less of the variance of the
+    error on what they were not fitted to than coarseness could, half of it for a dominance of two, have so much less to
+    explain. Only where nothing else is named: what a name leaves beside it is foretold by others. What cannot be computed is
+    not foretold.
 
     Parameters
     ----------
@@ -44,14 +44,12 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
     asked
         Variance that they must explain, in units of the sensors' noise.
     is_named
-        Whether names were added: a heat without a name counts by what it explains.
+        Whether names were added: a heat without a name has no less to explain.
     """
-    there = mean_excess(simple)
-    explained = there - mean_excess(rich)
+    explained = mean_excess(simple) - mean_excess(rich)
     alone = is_named and not simple.effects
     told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
     if told is not None:
-        explained = min(explained, (1.0 - told**2) * (1.0 + there))
         asked *= min(1.0, policy.DOMINANCE * told**2)
     return explained / asked if asked > 0.0 else np.inf
 

@@ -257,8 +257,8 @@ def name_what_foretells(state: Search, needed: float) -> None:
     Heat that wanders stands for whatever lasts a while, such as a load that came on half-way: where a coarse network makes it
     large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off; or it tells
     another one that explains a part of it. There it is weighed by trajectories alone, must leave less of the error on what it
-    was not fitted to than one part in ``DOMINANCE`` of what the declared model leaves, or the names that were found (no name
-    does on most healthy finite elements), and no more misfit than these or a coarse network may.
+    was not fitted to than one part in ``DOMINANCE`` of what the declared model leaves, or the names that were found, and no more
+    misfit than these or a coarse network may. What was found stays where it would be withdrawn.
     """
     if state.left_out or any(effect.fallback for finding in state.findings for effect in finding.effects):
         return
@@ -297,11 +297,13 @@ def name_what_foretells(state: Search, needed: float) -> None:
     share, least = policy.REPEATABLE_SHARE, min(left_by.values())
     most = least + share * (mean_excess(state.base) - least)
     best, *others = sorted((j for j, _ in told if left_by.get(j.places, np.inf) <= most), key=foresight_of)
-    state.rejected += [replace(finding.judged, reason=OUTDONE) for finding in state.findings]
-    state.trial, state.findings = best.trial, [Finding(best, tuple(others))]
     named = {j.places for j in (best, *others)}
-    state.rejected = [j for j in state.rejected if j.places not in named]
-    withdraw(state, needed)
+    rest = [j for j in state.rejected if j.places not in named]
+    rest += [replace(finding.judged, reason=OUTDONE) for finding in state.findings]
+    instead = replace(state, trial=best.trial, findings=[Finding(best, tuple(others))], rejected=rest)
+    withdraw(instead, needed)
+    if instead.findings:
+        state.join(instead)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

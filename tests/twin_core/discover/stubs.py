@@ -50,7 +50,7 @@ class Stub:
     left: float = 0.0
     n_free: int = 3
     n_samples: int = N_READINGS
-    foresight: float | None = None
+    foresight: float = 1.0
     fit: Fit = field(init=False)
 
     def __post_init__(self) -> None:
@@ -60,7 +60,7 @@ class Stub:
         return np.array([2.0 * self.left, 0.0])
 
 
-def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float | None = None) -> Trial:
+def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
     return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))
 
 

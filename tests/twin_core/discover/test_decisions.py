@@ -211,7 +211,7 @@ def test_open_loop_residuals_are_asked_too_where_a_name_would_be_withdrawn(
     assert stands(stub(left=before), stub(load("n0"), left=left)) == kept
 
 
-def test_where_foresight_cannot_be_computed_a_name_counts_by_what_it_explains(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(simple: Trial, rich: Trial) -> Validation:
         raise np.linalg.LinAlgError
 
