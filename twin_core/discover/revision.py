@@ -278,8 +278,10 @@ def name_what_foretells(state: Search, needed: float) -> None:
         evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))
         return replace(option, evidence=evidence, reason="")
 
-    def examined(option: Judged) -> tuple[Judged, float]:
+    def examined(option: Judged) -> tuple[Judged, float] | None:
         settled = resettled(state.base, option.trial)
+        if not policy.DOMINANCE * validate(state.base, settled).foresight < foresight:
+            return None  # whether it is a law takes far longer to tell
         told = examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
         return told, mean_excess(settled)
 
@@ -290,7 +292,7 @@ def name_what_foretells(state: Search, needed: float) -> None:
     asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
     likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
     seen = filter(None, [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]])
-    told = [(j, left) for j, left in seen if not j.reason and policy.DOMINANCE * foresight_of(j) < foresight]
+    told = [(j, left) for j, left in seen if not j.reason]
     left_by = {j.places: left for j, left in told if left <= most_left}
     if not left_by:
         return

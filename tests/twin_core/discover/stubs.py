@@ -75,4 +75,6 @@ def unnamed() -> Effect:
 
 def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresight: float = 0.5) -> Judged:
     validation = Validation(foresight, 1.0, foresight, 0.1, 1.0, 1, False)
-    return Judged((load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free), validation)
+    return Judged(
+        (load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free, foresight=foresight), validation
+    )
