@@ -1,9 +1,9 @@
 """The default calibration: trajectory matching by a second-order solver with exact sensitivities."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
+from twin_core.side_by_side import both
 from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -45,6 +46,8 @@ HUBER = 1.345
 """Residuals, in units of their noise, beyond which Huber's loss is linear: 95 % efficient where there is no outlier."""
 
 Loss = Literal["squared", "huber"]
+
+T = TypeVar("T")
 
 READINGS_PER_UNKNOWN = 2
 """Fewer are refused: any model passes through as many readings as it has unknowns."""
@@ -175,9 +178,14 @@ def fit_network(
     search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples, deadline=deadline)
     problem = recentred(problem, search.best)
     on_trajectories = partial(minimise, problem, deadline=deadline)
-    found = [attempted(partial(on_trajectories, search.best.unknowns), "open-loop trajectories", failures)]
+
     progress(0.4, "fitting in the presence of undeclared heat")
-    fits = [attempted(partial(fit_with_undeclared_heat, problem, deadline=deadline), "undeclared heat", failures)]
+    (first, why), (fit, and_why) = both(
+        partial(_attempted_apart, partial(on_trajectories, search.best.unknowns), "open-loop trajectories"),
+        partial(_attempted_apart, partial(fit_with_undeclared_heat, problem, deadline=deadline), "undeclared heat"),
+    )
+    failures += [*why, *and_why]
+    found, fits = [first], [fit]
     found += [attempted(partial(on_trajectories, f.unknowns()), "open-loop trajectories", failures) for f in fits if f]
     optima = [o for o in found if o is not None and o.status != "no_solution"]
     if not optima:
@@ -194,6 +202,12 @@ def fit_network(
     progress(0.95, "weighing what is left")
     whitener = fit_whitener(problem, problem.residuals(optimum.fit))
     return max(heat_fits, key=lambda f: f.log_posterior), Calibration(problem, optimum, whitener, step)
+
+
+def _attempted_apart(work: Callable[[], T], what: str) -> tuple[T | None, list[str]]:
+    """Return what :func:`attempted` returns, and the failure if there is one."""
+    failures: list[str] = []
+    return attempted(work, what, failures), failures
 
 
 def fit_trajectories(

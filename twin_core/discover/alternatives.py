@@ -5,9 +5,7 @@ name or another by many nats that say nothing. There, names that explain as much
 itself hardly tells from the best one.
 """
 
-import os
 from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -59,16 +57,19 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     )
     starts += [bare] if bare is not None else []
 
-    def compared(option: tuple[Calibration, Effect]) -> Judged | None:
-        work = partial(_explaining, state, simple, *option, least, needed)
-        return state.attempt(work, f"{option[1].label} instead of {own.label}")
-
     about = [about_trajectory(start.problem, start.optimum) for start in starts]
     fits = [(simple.fit, starts[0]), *zip(about, starts, strict=True)]
     options = [(start, effect) for fit, start in fits for effect in _near(simple, fit, own, known)]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        told = [j for j in pool.map(compared, options) if j is not None]
-    return Finding(finding.judged, (*finding.alternatives, *once_each(told)))
+    told = state.attempt_each(
+        [
+            (
+                partial(_explaining, state, simple, start, effect, least, needed),
+                f"{effect.label} instead of {own.label}",
+            )
+            for start, effect in options
+        ]
+    )
+    return Finding(finding.judged, (*finding.alternatives, *once_each([j for j in told if j is not None])))
 
 
 def _near(simple: Trial, about: HeatFit, own: Effect, known: Collection[Place]) -> list[Effect]:

@@ -1,7 +1,8 @@
 """Confirmation: a full refit with an effect in place, its evidence, and how it predicts what it was not fitted to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtrc
@@ -15,9 +16,10 @@ from twin_core.calibrate.undeclared.model import HeatFit, linearise, log_likelih
 from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
 from twin_core.discover.left_out import blocked_errors, forward_error
-from twin_core.discover.once import once
+from twin_core.discover.once import ask_each, once
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.network.model import build_network
+from twin_core.side_by_side import side_by_side
 
 LN_2 = float(np.log(2.0))
 
@@ -210,7 +212,8 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
     layout = problem.network.layout
     touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
     resized = touched if quick else None
-    fits = [fit_with_undeclared_heat(problem, s, near=base.fit, n_passes=n_passes, resized=resized) for s in starts]
+    fitted = partial(fit_with_undeclared_heat, problem, near=base.fit, n_passes=n_passes, resized=resized)
+    fits = side_by_side([partial(fitted, start) for start in starts])
     fit = max(fits, key=lambda f: f.log_posterior)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
@@ -240,10 +243,16 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     """
     calibration = rich.calibration()
     free = calibration.optimum.unknowns[: calibration.problem.n_free]
-    own = fit_with_undeclared_heat(calibration.problem, free, early_prior_std=(np.inf,) * 3)
-    along = fit_with_undeclared_heat(calibration.problem, free, near=rich.fit)
-    near = try_effects(simple, rich.present_effects, n_passes=15).fit
-    fit = max(own, along, near, key=lambda f: f.log_posterior)
+    own: Callable[[], HeatFit] = partial(
+        fit_with_undeclared_heat, calibration.problem, free, early_prior_std=(np.inf,) * 3
+    )
+    along: Callable[[], HeatFit] = partial(fit_with_undeclared_heat, calibration.problem, free, near=rich.fit)
+
+    def near() -> HeatFit:
+        return try_effects(simple, rich.present_effects, n_passes=15).fit
+
+    fits: list[HeatFit] = side_by_side([own, along, near])
+    fit = max(fits, key=lambda f: f.log_posterior)
     effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
     return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None)
 
@@ -379,11 +388,14 @@ def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence
 
 def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
-    before, after = simple.block_errors(), rich.block_errors()
     misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
+    instant = _last_instant(simple, rich)
+    foretold = [simple.forward_error, rich.forward_error] if instant is None else []
+    ask_each(simple.block_errors, rich.block_errors, *foretold)
+    before, after = simple.block_errors(), rich.block_errors()
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
     ratio = max(float(np.sqrt(after.sum() / max(before.sum(), 1e-300))), where_fitted)
-    forward = _forward_ratio(simple, rich)
+    forward = _forward_ratio(simple, rich, instant)
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
@@ -391,11 +403,8 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
 
 
-def _forward_ratio(simple: Trial, rich: Trial) -> float:
-    """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
-
-    An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
-    """
+def _last_instant(simple: Trial, rich: Trial) -> float | None:
+    """Return when the last event begins that the rich trial has and the simple one has not, if there is one."""
     known = {effect.place for effect in simple.effects}
     instants = [
         float(effect.values[q.name])
@@ -404,10 +413,18 @@ def _forward_ratio(simple: Trial, rich: Trial) -> float:
         for q in effect.parameter_specs()
         if q.instant is not None
     ]
-    if not instants:
+    return max(instants, default=None)
+
+
+def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
+    """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
+
+    An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
+    """
+    if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
-        before, after = (forward_error(trial.calibration(), max(instants)) for trial in (simple, rich))
+        before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
     return float(np.sqrt(after / max(before, 1e-300))) if before > 0.0 else 1.0
 
 

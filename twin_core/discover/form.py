@@ -1,17 +1,16 @@
 """The form of a finding: a name stands for a law, so nothing that repeats with temperature may be left where it acts,
 and the declared quantities must be left where they may be."""
 
-import os
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextvars import Context, copy_context
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
+from twin_core.side_by_side import side_by_side
 
 N_REFITS, N_RIVALS = 6, 2
 
@@ -104,14 +103,10 @@ def more_is_left_elsewhere(
 
 
 def _refitted(trial: Trial, effects: Sequence[Effect]) -> list[Trial]:
-    """Return a trial with each of some effects on top, side by side, under the same deadline."""
-    contexts = [copy_context() for _ in effects]
-
-    def fitted(context: Context, effect: Effect) -> Trial:
-        return context.run(try_effects, trial, (*trial.effects, effect), n_passes=6, quick=True)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return list(pool.map(fitted, contexts, effects))
+    """Return a trial with each of some effects on top, side by side."""
+    return side_by_side(
+        [partial(try_effects, trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in effects]
+    )
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:

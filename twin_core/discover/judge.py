@@ -1,9 +1,7 @@
 """Judgement: what was tried, what speaks for it, and whether that is enough to name it."""
 
 from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TypeVar
@@ -18,6 +16,7 @@ from twin_core.discover.form import Repeatable, acts_at, more_is_left_elsewhere,
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
+from twin_core.side_by_side import both, side_by_side
 from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
@@ -166,6 +165,19 @@ class Search:
             self.failures.append(f"{what}: {error}")
         return None
 
+    def attempt_each(self, works: Sequence[tuple[Callable[[], T], str]]) -> list[T | None]:
+        """Return what :meth:`attempt` returns of each piece of work and its name, done side by side: what they change is lost."""
+
+        def attempted_apart(work: Callable[[], T], what: str) -> tuple[T | None, list[str], list[str]]:
+            apart = replace(self, failures=[], left_out=[])
+            return apart.attempt(work, what), apart.failures, apart.left_out
+
+        told = side_by_side([partial(attempted_apart, work, what) for work, what in works])
+        for _, failures, left_out in told:
+            self.failures += failures
+            self.left_out += left_out
+        return [result for result, _, _ in told]
+
     def count(self, n_looked_at: int, *, fallback: bool) -> int:
         """Return how many effects and places were tried: a fallback comes after all the named ones."""
         if fallback:
@@ -252,11 +264,16 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     heats = [effect for effect in named if "sensor" not in effect.where]
     most = most_left(judged.evidence.log_bayes_factor, needed)
     trial = judged.trial
-    with ThreadPoolExecutor(1) as pool:  # side by side, under the same deadline
-        other = pool.submit(copy_context().run, outdone_by_a_free_form, simple, trial, named, needed, most)
-        beside = repeatable_heat(trial, acts_at(trial, heats), needed) if heats else Repeatable()
+
+    def what_is_left() -> Repeatable:
+        return repeatable_heat(trial, acts_at(trial, heats), needed) if heats else Repeatable()
+
+    def what_outdoes() -> float | None:
+        return outdone_by_a_free_form(simple, trial, named, needed, most)
+
+    beside, other = both(what_is_left, what_outdoes)
     left = [beside.removed] if beside.log_bayes_factor > most else []
-    left += [removed for removed in [other.result()] if removed is not None]
+    left += [other] if other is not None else []
     if not left or more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
         return ""
     return SMALL_REMAINDER if max(left) <= _little(simple, trial, max(left)) else NO_LAW

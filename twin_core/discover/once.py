@@ -5,6 +5,8 @@ from functools import wraps
 from threading import RLock
 from typing import Any, TypeVar
 
+from twin_core.side_by_side import side_by_side
+
 Value = TypeVar("Value")
 
 
@@ -14,7 +16,7 @@ def once(work: Callable[[Any], Value]) -> Callable[[Any], Value]:
     Threads wait for each other where they ask for the same object only: ``functools.cached_property`` of Python 3.11 holds one
     lock for all objects of a class, so that optimisers behind it would run one after the other.
     """
-    key = f"_once_{work.__name__}"
+    key = _key(work.__name__)
 
     @wraps(work)
     def ask(self: Any) -> Value:
@@ -26,3 +28,21 @@ def once(work: Callable[[Any], Value]) -> Callable[[Any], Value]:
             return value
 
     return ask
+
+
+def ask_each(*questions: Callable[[], Any]) -> None:
+    """Do the work of several such methods of some objects side by side, so that each is known when it is asked for.
+
+    Parameters
+    ----------
+    questions
+        Bound methods.
+    """
+    keys: dict[tuple[int, str], Any] = {(id(q.__self__), _key(q.__name__)): q for q in questions}  # type: ignore[attr-defined]
+    new = [(key, q) for (_, key), q in keys.items() if key not in q.__self__.__dict__]
+    for (key, question), value in zip(new, side_by_side([q for _, q in new]), strict=True):
+        question.__self__.__dict__[key] = value
+
+
+def _key(name: str) -> str:
+    return f"_once_{name}"

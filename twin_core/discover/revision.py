@@ -1,8 +1,6 @@
 """Revision: what is withdrawn, exchanged or told beside what a search has found, once more than it is known."""
 
-import os
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
@@ -37,6 +35,7 @@ from twin_core.discover.judge import (
     worth,
 )
 from twin_core.effects.base import Effect, touched_nodes
+from twin_core.side_by_side import side_by_side
 
 N_EXCHANGED = 2
 """Refused options that are tried in the place of a finding."""
@@ -371,17 +370,7 @@ def _attempted_without(state: Search, places: Collection[object]) -> Without | N
     It is asked for again and again, of the same trial: once is enough.
     """
     gone = frozenset(places)
-    if state.without is None or state.without[0] is not state.trial:
-        state.without = state.trial, {}
-    known = state.without[1]
-
-    def weighed() -> Without:
-        without = _refitted([effect for effect in state.trial.effects if effect.place not in gone], state)
-        return without, weigh(without, state.trial, 1).log_bayes_factor
-
-    if gone not in known:
-        known[gone] = state.attempt(weighed, "the model without " + " and ".join(str(place) for place in gone))
-    return known[gone]
+    return _without_each(state, [gone])[gone]
 
 
 def _refitted(effects: Sequence[Effect], state: Search) -> Trial:
@@ -396,7 +385,8 @@ def _refitted(effects: Sequence[Effect], state: Search) -> Trial:
     below = known[max((forms for forms in known if forms < wanted), key=len)]
     there = {effect.place for effect in below.effects}
     more = [effect for effect in effects if effect.place not in there]
-    fits = [try_effects(state.trial, effects, n_passes=10), try_effects(below, (*below.effects, *more), n_passes=10)]
+    starts = [(state.trial, effects), (below, (*below.effects, *more))]
+    fits = side_by_side([partial(try_effects, *start, n_passes=10) for start in starts])
     return max(fits, key=lambda trial: weigh(state.base, trial, 1).log_bayes_factor)
 
 
@@ -407,8 +397,18 @@ def _forms(effects: Sequence[Effect]) -> frozenset[object]:
 
 def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[frozenset[object], Without | None]:
     """Return the same for several sets of places, side by side."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return dict(zip(sets, pool.map(partial(_attempted_without, state), sets), strict=True))
+    if state.without is None or state.without[0] is not state.trial:
+        state.without = state.trial, {}
+    known = state.without[1]
+
+    def weighed(gone: frozenset[object]) -> Without:
+        without = _refitted([effect for effect in state.trial.effects if effect.place not in gone], state)
+        return without, weigh(without, state.trial, 1).log_bayes_factor
+
+    new = [gone for gone in dict.fromkeys(sets) if gone not in known]
+    works = [(partial(weighed, gone), "the model without " + " and ".join(map(str, gone))) for gone in new]
+    known |= zip(new, state.attempt_each(works), strict=True)
+    return {gone: known[gone] for gone in sets}
 
 
 def _drop(state: Search, places: Collection[object], without: Trial, lost: float) -> None:

@@ -1,9 +1,7 @@
 """The search: which effects, alone or together, the training record supports. It never sees a hold-out."""
 
-import os
 import time
 from collections.abc import Collection, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -279,26 +277,22 @@ def _best_pairs(ranked: Sequence[Probe], trial: Trial, needed: float) -> list[tu
 def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int) -> list[Judged]:
     """Fit every option in the presence of undeclared heat: all in a few passes, the best ones until they settle."""
 
-    def fitted(start: Trial, option: tuple[Effect, ...], n_passes: int, *, quick: bool = False) -> Judged | None:
-        work = partial(_judge, state, start, option, n_tried, n_passes=n_passes, quick=quick)
-        return state.attempt(work, " with ".join(effect.label for effect in option))
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        quick = _done(pool.map(lambda option: fitted(state.trial, option, 3, quick=True), options))
-        judged = sorted(quick, key=worth)
-        best = judged[0].evidence.log_bayes_factor if judged else 0.0
-        near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
-        here = acts_at(judged[0].trial, judged[0].effects) if judged else set()
-        likely = [j for j in judged if j.evidence.log_bayes_factor > best - SETTLING_NATS]
-        rivals = [*quick[:N_FIRST], *[j for j in likely if acts_at(j.trial, j.effects) == here][:N_FORMS]]
-        near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
-        settled = _done(pool.map(lambda j: fitted(j.trial, j.effects, 12), near))
-        rest = [j for j in judged if all(j is not n for n in near)]
-        forms = _forms_of_the_best(settled)
-        compared = _done(
-            pool.map(lambda j: state.attempt(partial(_from_trajectories, state, j, n_tried), j.labels), forms)
-        )
-        return once_each([*settled, *compared, *rest])
+    first = [partial(_judge, state, state.trial, option, n_tried, n_passes=3, quick=True) for option in options]
+    labels = [" with ".join(effect.label for effect in option) for option in options]
+    quick = _done(state.attempt_each(list(zip(first, labels, strict=True))))
+    judged = sorted(quick, key=worth)
+    best = judged[0].evidence.log_bayes_factor if judged else 0.0
+    near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
+    here = acts_at(judged[0].trial, judged[0].effects) if judged else set()
+    likely = [j for j in judged if j.evidence.log_bayes_factor > best - SETTLING_NATS]
+    rivals = [*quick[:N_FIRST], *[j for j in likely if acts_at(j.trial, j.effects) == here][:N_FORMS]]
+    near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
+    further = [(partial(_judge, state, j.trial, j.effects, n_tried, n_passes=12), j.labels) for j in near]
+    settled = _done(state.attempt_each(further))
+    rest = [j for j in judged if all(j is not n for n in near)]
+    forms = _forms_of_the_best(settled)
+    compared = _done(state.attempt_each([(partial(_from_trajectories, state, j, n_tried), j.labels) for j in forms]))
+    return once_each([*settled, *compared, *rest])
 
 
 def _done(options: Iterable[Judged | None]) -> list[Judged]:

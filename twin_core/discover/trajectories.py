@@ -4,9 +4,7 @@ What long trajectories suggest is weighed as everything else is: against heat th
 that wanders at the sensors.
 """
 
-import os
 from collections.abc import Collection, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from math import comb
 
@@ -108,14 +106,8 @@ def _extended_near(state: Search, near: Sequence[Probe], needed: float, *, fallb
 
 def _all_fitted(state: Search, seed: Trial, effects: Sequence[Effect], n_tried: int) -> list[Judged]:
     """Return a trial with each of some effects on top, fitted on trajectories and judged against the state's model."""
-
-    def fitted(effect: Effect) -> Judged | None:
-        work = partial(_fitted, state, seed, effect, n_tried)
-        return state.attempt(work, f"{effect.label} on trajectories")
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # compiled loops and linear algebra run side by side
-        judged = list(pool.map(fitted, effects))
-    return [j for j in judged if j is not None]
+    works = [(partial(_fitted, state, seed, effect, n_tried), f"{effect.label} on trajectories") for effect in effects]
+    return [j for j in state.attempt_each(works) if j is not None]
 
 
 def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged | None:
@@ -141,5 +133,5 @@ def _settled(state: Search, options: Sequence[Judged], n_tried: int, needed: flo
         return _judged(state, resettled(state.trial, judged.trial), n_tried)
 
     likely = [j for j in options if j.evidence.log_bayes_factor > needed - SETTLING_NATS]
-    done = [state.attempt(partial(settled, j), f"{j.labels} on trajectories") for j in likely]
+    done = state.attempt_each([(partial(settled, j), f"{j.labels} on trajectories") for j in likely])
     return [j for j in done if j is not None]

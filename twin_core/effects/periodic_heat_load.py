@@ -101,8 +101,6 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     node
         Whose sensors are looked at; all sensors where it has none.
     """
-    from scipy.signal import find_peaks  # loads scipy.stats: half a second that few need
-
     window = longest_segment(survey)
     spec = survey.layout.spec
     own = [i for i, sensor in enumerate(spec.sensors) if survey.layout.sensor_node(sensor) == node]
@@ -116,6 +114,8 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     seen = (frequency * (grid_s[-1] - grid_s[0]) >= LEAST_PERIODS) & (frequency * step <= 1.0 / SAMPLES_PER_PERIOD)
     found: list[int] = []
     for spectrum in (power, power * frequency**2):
-        peaks, _ = find_peaks(np.where(seen, spectrum, 0.0))
+        looked_at = np.where(seen, spectrum, 0.0)
+        inner = looked_at[1:-1]
+        peaks = 1 + np.flatnonzero((inner > looked_at[:-2]) & (inner >= looked_at[2:]))
         found += peaks[np.argsort(-spectrum[peaks])[:N_PEAKS]].tolist()
     return [1.0 / float(frequency[i]) for i in dict.fromkeys(found)]

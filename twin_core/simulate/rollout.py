@@ -19,7 +19,7 @@ from twin_core.network.model import Network
 from twin_core.network.storage import to_enthalpy_K, to_temperatures_K
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import NOT_NEAR, march
-from twin_core.simulate.splitting import STRETCH, Split, anchor_K, limits
+from twin_core.simulate.splitting import Split, anchor_K, limits, stretches
 
 TOLERANCE_K = 1e-7
 N_NEWTON = 25
@@ -89,8 +89,7 @@ def rollout(
     """
     out = np.full((forcing.n_steps, 2, start_K.size), np.nan)
     state, about_K = start_K.astype(np.float64), None
-    for first in range(0, forcing.n_steps, STRETCH):
-        last = min(first + STRETCH, forcing.n_steps)
+    for first, last in stretches(forcing.n_steps, start_K.size):
         about_K = anchor_K(state, about_K)
         split = Split.at(network, values, forcing, first, last, about_K)
         n_solved = _stretch(split, state, out[first:last], None if near is None else near[first:last])

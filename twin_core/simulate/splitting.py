@@ -24,8 +24,9 @@ from twin_core.simulate.kernels import Remainder
 from twin_core.simulate.modes import Modes
 from twin_core.simulate.relays import NO_RELAYS, Relays
 
-STRETCH = 1024
-"""Steps that are taken together, and after which A is renewed where temperatures have moved."""
+STRETCH, LONGEST_STRETCH, STRETCH_STATES = 1024, 8192, 65_536
+"""Steps that are taken together, and after which A is renewed where temperatures have moved. The first stretch may come from
+far away; those after it are longer for few nodes, where a call costs more than what it computes."""
 
 ROUND_K = 10.0
 """A is linearised about temperatures rounded to this in degrees Celsius: a constant of the scheme, not of what is fitted."""
@@ -36,12 +37,21 @@ DIFFERENCE = 1e-4
 """Relative step of a parameter; couplings are linear in theirs, so that a central difference is good to rounding."""
 
 
+def stretches(n_steps: int, n_nodes: int) -> Iterator[tuple[int, int]]:
+    """Yield (first step, last step) of each stretch of steps of a network."""
+    longest = min(max(STRETCH_STATES // n_nodes, STRETCH), LONGEST_STRETCH)
+    first, last = 0, min(STRETCH, n_steps)
+    while first < n_steps:
+        yield first, last
+        first, last = last, min(last + longest, n_steps)
+
+
 def anchors(begins_K: FloatArray) -> Iterator[tuple[int, int, FloatArray]]:
     """Yield (first step, last step, temperatures about which A is linearised) of each stretch of (n_steps, n_nodes)."""
     about = None
-    for first in range(0, begins_K.shape[0], STRETCH):
+    for first, last in stretches(*begins_K.shape):
         about = anchor_K(begins_K[first], about)
-        yield first, min(first + STRETCH, begins_K.shape[0]), about
+        yield first, last, about
 
 
 def pieces(stretches: Iterable[tuple[int, int, FloatArray]], most: int) -> Iterator[tuple[int, int, FloatArray]]:

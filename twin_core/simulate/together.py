@@ -18,7 +18,7 @@ from twin_core.simulate.kernels import STEP_K, Remainder
 from twin_core.simulate.matrices import multiply_columns
 from twin_core.simulate.modes import Modes, weights
 from twin_core.simulate.rollout import LIMIT_K, Rollout, rollout
-from twin_core.simulate.splitting import STRETCH, Split, anchor_K
+from twin_core.simulate.splitting import LONGEST_STRETCH, Split, anchor_K, stretches
 
 N_FIXED = 20
 """Iterations of a step: contracting by less than a third, as few do, they reach the rounding of a temperature."""
@@ -96,7 +96,7 @@ def rollouts(
         NaN from where a member has no solution.
     """
     found = np.empty((variants.n_members, after.size, observed.size))
-    most = max(1, MOST_VALUES // max(2 * min(forcing.n_steps, STRETCH) * near.start_K.size, 1))
+    most = max(1, MOST_VALUES // max(2 * min(forcing.n_steps, LONGEST_STRETCH) * near.start_K.size, 1))
     for first in range(0, variants.n_members, most):
         members = slice(first, min(first + most, variants.n_members))
         some = variants.part(members, slice(None))
@@ -129,8 +129,7 @@ def _at_once(
     out = np.empty((forcing.n_steps + 1, observed.size, n_members))
     out[0] = near.start_K[observed, None]
     state, about_K = np.tile(near.start_K[:, None], (1, n_members)), None
-    for first in range(0, forcing.n_steps, STRETCH):
-        last = min(first + STRETCH, forcing.n_steps)
+    for first, last in stretches(forcing.n_steps, near.start_K.size):
         steps = slice(first, last)
         about_K = anchor_K(near.stages_K[first, 0], about_K)
         here = replace(

@@ -4,8 +4,15 @@ from typing import Any
 
 import pytest
 
+from twin_core import side_by_side
 from twin_core.discover import coarseness, revision
 from twin_core.discover.confirm import Trial, Validation
+
+
+@pytest.fixture
+def one_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All work is done in this process, where a test can count it."""
+    monkeypatch.setattr(side_by_side, "n_cores", lambda: 1)
 
 
 @pytest.fixture

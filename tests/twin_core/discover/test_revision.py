@@ -113,6 +113,7 @@ def test_what_explains_no_more_than_what_stays_is_withdrawn(
     assert all(j.reason == NO_MORE for j in state.rejected) and len(state.rejected) == len(own) - len(kept)
 
 
+@pytest.mark.usefixtures("one_core")
 def test_a_model_without_a_finding_is_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pruning and withdrawing ask for the same fits; another trial asks for its own."""
     fitted: list[tuple[str, ...]] = []

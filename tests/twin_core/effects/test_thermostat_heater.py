@@ -118,7 +118,11 @@ def test_sensitivities_are_the_central_difference_through_its_switching() -> Non
 def test_it_remembers_wherever_a_rollout_is_cut() -> None:
     time_s = 20.0 * np.arange(1500)
     whole = rolled(time_s, driven_wall_K(time_s), 290.0)
-    with patch.object(rollout_module, "STRETCH", 40):
+
+    def in_pieces(n_steps: int, _: int) -> list[tuple[int, int]]:
+        return [(first, min(first + 40, n_steps)) for first in range(0, n_steps, 40)]
+
+    with patch.object(rollout_module, "stretches", in_pieces):
         cut = rolled(time_s, driven_wall_K(time_s), 290.0)
     np.testing.assert_allclose(cut[:, 0], whole[:, 0], atol=1e-6)
 

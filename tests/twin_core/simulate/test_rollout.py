@@ -355,11 +355,11 @@ def test_sensitivities_are_the_central_difference(name: str | None) -> None:
 
 
 def test_sensitivities_go_on_across_stretches() -> None:
-    """Beyond 8192 steps the derivatives are handed over from one stretch to the next."""
+    """Beyond 9216 steps the derivatives are handed over from one stretch to the next."""
     network = chain()
     record = record_of(2400.0 * np.arange(8), Q=np.where(np.arange(8) % 3 < 1, 60.0, 0.0))
-    fine = build_forcing(network, record, 2.0)
-    assert fine.n_steps > 8192
+    fine = build_forcing(network, record, 1.5)
+    assert fine.n_steps > 9216
     path = rollout(network, network.parameters.values, START_K, fine)
     found = all_sensitivities(network, fine, path)
     free = network.parameters.free

@@ -83,7 +83,7 @@ def test_modes_are_those_of_a() -> None:
 
 def test_a_is_renewed_where_temperatures_have_moved() -> None:
     begins = np.concatenate(
-        [np.full((1024, 1), 291.0), np.full((1024, 1), 300.0), np.full((500, 1), 291.0 + 2.0 * FAR_K)]
+        [np.full((1024, 1), 291.0), np.full((8192, 1), 300.0), np.full((500, 1), 291.0 + 2.0 * FAR_K)]
     )
     found = [(first, last, float(about[0])) for first, last, about in anchors(begins)]
-    assert found == [(0, 1024, 293.15), (1024, 2048, 293.15), (2048, 2548, 333.15)]
+    assert found == [(0, 1024, 293.15), (1024, 9216, 293.15), (9216, 9716, 333.15)]

@@ -10,7 +10,7 @@ from twin_core.network.model import Network, build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
-from twin_core.simulate.splitting import STRETCH
+from twin_core.simulate.splitting import LONGEST_STRETCH
 from twin_core.simulate.together import Variants, rollouts
 
 START_K = np.array([300.0, 280.0])
@@ -50,7 +50,7 @@ def members(net: Network, n_steps: int, powers_W: np.ndarray, rooms_K: np.ndarra
 
 def test_members_of_a_linear_network_are_matrix_exponentials() -> None:
     """Over more than a stretch, after which the modes are taken anew."""
-    n_steps, powers_W, rooms_K = STRETCH + 50, np.array([0.0, 10.0, 35.0]), np.array([250.0, 285.0, 290.0])
+    n_steps, powers_W, rooms_K = LONGEST_STRETCH + 50, np.array([0.0, 10.0, 35.0]), np.array([250.0, 285.0, 290.0])
     found = members(network(), n_steps, powers_W, rooms_K)
     coupling = laplacian(2, [(0, 1)], [CONDUCTANCE_W_PER_K]) + np.diag([0.0, CONDUCTANCE_W_PER_K])
     time_s = STEP_S * np.arange(n_steps + 1.0)

@@ -1,0 +1,193 @@
+"""Independent pieces of work side by side, in processes forked for them.
+
+A fit is thousands of short calls into NumPy, and threads wait for each other at the interpreter: two of them take as long as
+one. A forked process has the record, the models and all that is known of them already. It sends back what it has made; what
+was there before comes back as itself, not as a copy.
+"""
+
+import io
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from functools import partial
+from multiprocessing.connection import Connection, Pipe, wait
+from threading import RLock, Thread
+from types import FunctionType, MethodType, ModuleType
+from typing import Any, TypeVar, cast
+
+import numpy as np
+
+T = TypeVar("T")
+U = TypeVar("U")
+
+CAN_FORK = sys.platform == "linux"
+"""Elsewhere a fork of a process that has used its system's libraries is not safe, and work is done one after the other."""
+
+_INDEX_BYTES = 2
+
+_is_forked = False
+
+
+def n_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if CAN_FORK else 1
+
+
+def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
+    """Return what each of some pieces of work returns, done on all cores.
+
+    What they change is lost; what they raise is raised here, that of the first one that did. Within a piece, further pieces are
+    done one after the other.
+
+    Parameters
+    ----------
+    works
+        Functions without arguments, or partial ones. What they return must be picklable, but for locks.
+    """
+    n_processes = min(len(works), n_cores())
+    if n_processes < 2 or _is_forked:
+        return [work() for work in works]
+    told = _told(works, n_processes)
+    # A process that was killed, or could not send what it had made, has left its work undone.
+    done = [told[i] if i in told else (True, work()) for i, work in enumerate(works)]
+    for returned, value in done:
+        if not returned:
+            raise cast(BaseException, value)
+    return [cast(T, value) for _, value in done]
+
+
+def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
+    """Return what two pieces of work return, done side by side."""
+    done: list[object] = side_by_side([first, second])
+    return cast(tuple[T, U], tuple(done))
+
+
+def _told(works: Sequence[Callable[[], T]], n_processes: int) -> dict[int, tuple[bool, T | Exception]]:
+    """Return by its number whether each piece of work returned, and what it returned or raised."""
+    known = _reachable(works)
+    todo, end_of_todo = os.pipe()
+    alive, end_of_alive = os.pipe()
+    os.write(end_of_todo, b"".join(i.to_bytes(_INDEX_BYTES, "little") for i in range(len(works))))
+    os.close(end_of_todo)  # whoever reads beyond the last number learns that nothing is left
+    processes: list[int] = []
+    receivers: list[Connection] = []
+    told: dict[int, tuple[bool, T | Exception]] = {}
+    try:
+        for _ in range(n_processes):
+            receiver, sender = Pipe(duplex=False)
+            process = os.fork()
+            if process == 0:
+                os.close(end_of_alive)
+                _work(works, known, todo, alive, sender)
+            sender.close()
+            processes.append(process)
+            receivers.append(receiver)
+        while receivers:
+            for receiver in cast(list[Connection], wait(receivers)):
+                try:
+                    told.update([_loaded(receiver.recv_bytes(), known)])
+                except (EOFError, OSError):
+                    receiver.close()
+                    receivers.remove(receiver)
+    finally:
+        for descriptor in (todo, alive, end_of_alive):
+            os.close(descriptor)  # the processes end with the last of these, whatever ended the work
+        for receiver in receivers:
+            receiver.close()
+        for process in processes:
+            with suppress(ChildProcessError):
+                os.waitpid(process, 0)
+    return told
+
+
+def _work(
+    works: Sequence[Callable[[], object]], known: dict[int, object], todo: int, alive: int, sender: Connection
+) -> None:
+    """Do work until none is left: the whole life of a forked process."""
+    global _is_forked
+    _is_forked = True
+    status = 1
+    try:
+        Thread(target=_end_with, args=(alive,), daemon=True).start()
+        while number := os.read(todo, _INDEX_BYTES):
+            i = int.from_bytes(number, "little")
+            told: tuple[bool, object]
+            try:
+                told = True, works[i]()
+            except Exception as error:
+                told = False, error
+            sender.send_bytes(_dumped((i, told), known))
+        status = 0
+    finally:
+        os._exit(status)  # nothing that the parent has set up for its own end is ours to do
+
+
+def _end_with(alive: int) -> None:
+    """End this process when the one that forked it does, however it ends: nobody would want the result."""
+    os.read(alive, 1)
+    os._exit(1)
+
+
+class _Pickler(pickle.Pickler):
+    """Tells what the other process has by its address there, which is its own."""
+
+    def __init__(self, file: io.BytesIO, known: dict[int, object]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self._known = known
+
+    def persistent_id(self, obj: object) -> int | None:
+        return id(obj) if id(obj) in self._known else None
+
+    def reducer_override(self, obj: object) -> Any:
+        """A lock that was taken to compute what is sent along is not sent along."""
+        return (RLock, ()) if isinstance(obj, type(RLock())) else NotImplemented
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: io.BytesIO, known: dict[int, object]) -> None:
+        super().__init__(file)
+        self._known = known
+
+    def persistent_load(self, pid: int) -> object:
+        return self._known[pid]
+
+
+def _dumped(value: object, known: dict[int, object]) -> bytes:
+    file = io.BytesIO()
+    _Pickler(file, known).dump(value)
+    return file.getvalue()
+
+
+def _loaded(content: bytes, known: dict[int, object]) -> tuple[int, Any]:
+    loaded: tuple[int, Any] = _Unpickler(io.BytesIO(content), known).load()
+    return loaded
+
+
+def _reachable(works: Iterable[object]) -> dict[int, object]:
+    """Return all objects with attributes and all arrays that some pieces of work hold, by their address."""
+    found: dict[int, object] = {}
+    seen: set[int] = set()
+    left: list[object] = [*works]
+    while left:
+        thing = left.pop()
+        if id(thing) in seen or isinstance(thing, (ModuleType, type)):
+            continue
+        seen.add(id(thing))
+        if isinstance(thing, np.ndarray):
+            found[id(thing)] = thing
+        elif isinstance(thing, partial):
+            left += [thing.func, thing.args, thing.keywords]
+        elif isinstance(thing, MethodType):
+            left.append(thing.__self__)
+        elif isinstance(thing, FunctionType):
+            left += [cell.cell_contents for cell in thing.__closure__ or ()]
+        elif isinstance(thing, dict):
+            left += thing.values()
+        elif isinstance(thing, (list, tuple, set, frozenset)):
+            left += thing
+        elif hasattr(thing, "__dict__"):
+            found[id(thing)] = thing
+            left += vars(thing).values()
+    return found
