@@ -67,7 +67,7 @@ class Result:
     hung
         Whether it was ended because it took too long.
     seconds, peak_MB
-        Wall time of the closed loop, and the largest resident memory of its process.
+        Wall time of the closed loop, and the largest resident memory of one of its processes.
     verdict, found, effects, n_states
         The report's verdict; findings in words; their names; nodes, hidden masses and lagging sensors.
     before_K, after_K
@@ -241,7 +241,8 @@ def measure(split: Split, data: Path, code: str, deadline_s: float) -> Result:
         result = result_of(split, prepared, loop, blank)
     except Exception as error:
         result = replace(blank, seconds=time.perf_counter() - begun, error=_one_line(error))
-    return replace(result, peak_MB=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+    peaks = [resource.getrusage(whose).ru_maxrss for whose in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return replace(result, peak_MB=max(peaks) / 1024.0)
 
 
 def _compile() -> None:

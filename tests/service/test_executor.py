@@ -1,15 +1,19 @@
 """Worker processes: they stand back behind the service."""
 
 import os
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 
-from service.jobs.executor import NICENESS, ProcessPerTask, Task
+from service.jobs.executor import NICENESS, JobFailed, ProcessPerTask, Task
 from tests.service.conftest import SPEC
 from tests.service.server import FAKE, Server
+from twin_core import side_by_side
 
 
 def niceness(*, progress: Callable[[float, str], None]) -> int:
@@ -20,6 +24,29 @@ def niceness(*, progress: Callable[[float, str], None]) -> int:
 def test_a_job_has_a_low_priority() -> None:
     executor = ProcessPerTask(1, 280.0)  # it may wait long for a processor: that is what low means
     assert executor.start(Task(niceness)).result() == min(os.nice(0) + NICENESS, 19)
+    executor.shutdown()
+
+
+def hoard(path: str) -> float:
+    """Hold 500 MiB until the task is ended."""
+    held = np.ones(500 * 2**17)
+    Path(path).touch()
+    time.sleep(600.0)
+    return float(held[0])
+
+
+def hoarding(folder: str, *, progress: Callable[[float, str], None]) -> list[float]:
+    """Hold 1000 MiB in two forked processes."""
+    side_by_side.n_cores = lambda: 2
+    return side_by_side.side_by_side([partial(hoard, f"{folder}/{i}") for i in range(2)])
+
+
+@pytest.mark.skipif(not side_by_side.CAN_FORK, reason="this system does not fork safely")
+def test_the_memory_of_forked_processes_counts(tmp_path: Path) -> None:
+    """Each of them alone stays below the limit."""
+    executor = ProcessPerTask(1, 280.0, memory_MiB=900.0)
+    with pytest.raises(JobFailed, match="needed more than 900 MiB"):
+        executor.start(Task(hoarding, (str(tmp_path),))).result()
     executor.shutdown()
 
 
