@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection, Pipe, wait
-from threading import RLock, Thread
+from threading import RLock, Thread, current_thread, main_thread
 from types import FunctionType, MethodType, ModuleType
 from typing import Any, TypeVar, cast
 
@@ -39,7 +39,8 @@ def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
     """Return what each of some pieces of work returns, done on all cores.
 
     What they change is lost; what they raise is raised here, that of the first one that did. Within a piece, further pieces are
-    done one after the other.
+    done one after the other. So are all that are asked for by another thread than the main one: beside it there are others, and
+    what they have locked stays locked in a fork.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
         Functions without arguments, or partial ones. What they return must be picklable, but for locks.
     """
     n_processes = min(len(works), n_cores())
-    if n_processes < 2 or _is_forked:
+    if n_processes < 2 or _is_forked or current_thread() is not main_thread():
         return [work() for work in works]
     told = _told(works, n_processes)
     # A process that was killed, or could not send what it had made, has left its work undone.

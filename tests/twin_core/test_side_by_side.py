@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -90,6 +91,11 @@ def test_work_within_work_is_done_one_after_the_other() -> None:
         return {os.getpid(), *side_by_side([os.getpid, os.getpid])}
 
     assert [len(processes) for processes in side_by_side([nested, nested])] == [1, 1]
+
+
+def test_another_thread_does_not_fork() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(side_by_side, [os.getpid, os.getpid]).result() == [os.getpid()] * 2
 
 
 def test_the_work_of_a_process_that_dies_is_done_again() -> None:
