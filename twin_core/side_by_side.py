@@ -9,8 +9,8 @@ import io
 import os
 import pickle
 import sys
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import Connection, Pipe, wait
 from threading import RLock, Thread, current_thread, main_thread
@@ -47,16 +47,37 @@ def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
     works
         Functions without arguments, or partial ones. What they return must be picklable, but for locks.
     """
+    with ahead(works) as result:
+        return [result(i) for i in range(len(works))]
+
+
+@contextmanager
+def ahead(works: Sequence[Callable[[], T]]) -> Iterator[Callable[[int], T]]:
+    """Hand out the results of some pieces of work, as :func:`side_by_side`, by their number and each once.
+
+    From the first that is asked for on, others are under way; those are given up with the context.
+    """
     n_processes = min(len(works), n_cores())
     if n_processes < 2 or _is_forked or current_thread() is not main_thread():
-        return [work() for work in works]
-    told = _told(works, n_processes)
-    # A process that was killed, or could not send what it had made, has left its work undone.
-    done = [told[i] if i in told else (True, work()) for i, work in enumerate(works)]
-    for returned, value in done:
+        yield lambda i: works[i]()
+        return
+    coming, told = _told(works, n_processes), dict[int, tuple[bool, T | Exception]]()
+
+    def result(i: int) -> T:
+        while i not in told:
+            one = next(coming, None)
+            if one is None:  # a process that was killed, or could not send what it had made, has left its work undone
+                return works[i]()
+            told.update([one])
+        returned, value = told.pop(i)
         if not returned:
             raise cast(BaseException, value)
-    return [cast(T, value) for _, value in done]
+        return cast(T, value)
+
+    try:
+        yield result
+    finally:
+        coming.close()
 
 
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
@@ -65,8 +86,10 @@ def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     return cast(tuple[T, U], tuple(done))
 
 
-def _told(works: Sequence[Callable[[], T]], n_processes: int) -> dict[int, tuple[bool, T | Exception]]:
-    """Return by its number whether each piece of work returned, and what it returned or raised."""
+def _told(
+    works: Sequence[Callable[[], T]], n_processes: int
+) -> Generator[tuple[int, tuple[bool, T | Exception]], None, None]:
+    """Yield the number of each piece of work that is done, whether it returned, and what it returned or raised."""
     known = _reachable(works)
     todo, end_of_todo = os.pipe()
     alive, end_of_alive = os.pipe()
@@ -74,7 +97,6 @@ def _told(works: Sequence[Callable[[], T]], n_processes: int) -> dict[int, tuple
     os.close(end_of_todo)  # whoever reads beyond the last number learns that nothing is left
     processes: list[int] = []
     receivers: list[Connection] = []
-    told: dict[int, tuple[bool, T | Exception]] = {}
     try:
         for _ in range(n_processes):
             receiver, sender = Pipe(duplex=False)
@@ -88,10 +110,12 @@ def _told(works: Sequence[Callable[[], T]], n_processes: int) -> dict[int, tuple
         while receivers:
             for receiver in cast(list[Connection], wait(receivers)):
                 try:
-                    told.update([_loaded(receiver.recv_bytes(), known)])
+                    content = receiver.recv_bytes()
                 except (EOFError, OSError):
                     receiver.close()
                     receivers.remove(receiver)
+                else:
+                    yield _loaded(content, known)
     finally:
         for descriptor in (todo, alive, end_of_alive):
             os.close(descriptor)  # the processes end with the last of these, whatever ended the work
@@ -100,7 +124,6 @@ def _told(works: Sequence[Callable[[], T]], n_processes: int) -> dict[int, tuple
         for process in processes:
             with suppress(ChildProcessError):
                 os.waitpid(process, 0)
-    return told
 
 
 def _work(

@@ -15,8 +15,8 @@ import pytest
 
 from twin_core import side_by_side as module
 from twin_core._typing import FloatArray
-from twin_core.discover.once import ask_each, once
-from twin_core.side_by_side import both, side_by_side
+from twin_core.discover.once import ask_each, keep, known, once
+from twin_core.side_by_side import ahead, both, side_by_side
 
 pytestmark = pytest.mark.skipif(not module.CAN_FORK, reason="this system does not fork safely")
 
@@ -84,6 +84,34 @@ def test_several_costly_values_are_computed_side_by_side_and_kept() -> None:
 def test_an_error_is_raised_where_the_work_was_asked_for() -> None:
     with pytest.raises(ZeroDivisionError):
         side_by_side([partial(divmod, 1, 2), partial(divmod, 1, 0), partial(divmod, 2, 1)])
+
+
+def test_what_nobody_asks_for_any_more_is_given_up(tmp_path: Path) -> None:
+    def long(i: int) -> int:
+        if i > 0:
+            (tmp_path / str(os.getpid())).touch()
+            time.sleep(600.0)
+        return i
+
+    with ahead([partial(long, i) for i in range(4)]) as result:
+        assert result(0) == 0
+        while not os.listdir(tmp_path):
+            time.sleep(0.01)
+    assert not any(_runs(int(name)) for name in os.listdir(tmp_path))
+
+
+def test_nothing_is_begun_before_it_is_asked_for(tmp_path: Path) -> None:
+    with ahead([(tmp_path / str(i)).touch for i in range(4)]):
+        time.sleep(0.1)
+    assert not os.listdir(tmp_path)
+
+
+def test_costly_values_that_were_computed_elsewhere_are_kept() -> None:
+    models = [Model(np.ones(3)), Model(np.ones(3))]
+    models[0].total()
+    keep(models[1], known(models[0]))
+    assert models[1].total() == 3.0
+    assert models[1].log == []
 
 
 def test_work_within_work_is_done_one_after_the_other() -> None:

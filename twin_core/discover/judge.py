@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -13,10 +13,11 @@ from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import Repeatable, acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
+from twin_core.discover.once import keep, known
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
-from twin_core.side_by_side import both, side_by_side
+from twin_core.side_by_side import ahead, both
 from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
@@ -168,15 +169,26 @@ class Search:
     def attempt_each(self, works: Sequence[tuple[Callable[[], T], str]]) -> list[T | None]:
         """Return what :meth:`attempt` returns of each piece of work and its name, done side by side: what they change is lost."""
 
+        with self.attempts_ahead(works) as result:
+            return [result(i) for i in range(len(works))]
+
+    @contextmanager
+    def attempts_ahead(self, works: Sequence[tuple[Callable[[], T], str]]) -> Iterator[Callable[[int], T | None]]:
+        """Hand out what :meth:`attempt` returns of each piece of work and its name, as ``side_by_side.ahead`` does."""
+
         def attempted_apart(work: Callable[[], T], what: str) -> tuple[T | None, list[str], list[str]]:
             apart = replace(self, failures=[], left_out=[])
             return apart.attempt(work, what), apart.failures, apart.left_out
 
-        told = side_by_side([partial(attempted_apart, work, what) for work, what in works])
-        for _, failures, left_out in told:
-            self.failures += failures
-            self.left_out += left_out
-        return [result for result, _, _ in told]
+        with ahead([partial(attempted_apart, work, what) for work, what in works]) as told:
+
+            def result(i: int) -> T | None:
+                value, failures, left_out = told(i)
+                self.failures += failures
+                self.left_out += left_out
+                return value
+
+            yield result
 
     def count(self, n_looked_at: int, *, fallback: bool) -> int:
         """Return how many effects and places were tried: a fallback comes after all the named ones."""
@@ -202,27 +214,27 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     refused: list[Judged] = []
     passed: list[Judged] = []
     unlike: list[Trial] = []
-    for best in judged:
-        n_validated = sum(j.validation is not None for j in refused) + len(passed)
-        if best.evidence.log_bayes_factor <= needed or n_validated >= N_VALIDATED:
-            continue
-        if unlike:
-            left = state.attempt(partial(mean_excess, best.trial), best.labels)
-            if left is None:
-                refused.append(replace(best, reason=NOT_EXAMINED))
-            more_than_chance = by_chance(best.trial.n_samples)
-            if left is None or any(left + more_than_chance >= mean_excess(trial) for trial in unlike):
-                continue  # what explains no more is no better a name for this heat
-        examined = state.attempt(partial(examine, state.trial, best, needed), best.labels)
-        own, resembles = examined or (replace(best, reason=NOT_EXAMINED), False)
-        if own.reason:
-            refused.append(own)
-            if resembles:
-                unlike.append(own.trial)
-        else:
-            passed.append(own)
-            if is_free or stands(state.trial, own.trial):
+    likely = [j for j in judged if j.evidence.log_bayes_factor > needed]
+    with _examined(state, likely, needed) as examined:
+        for i, best in enumerate(likely):
+            if sum(j.validation is not None for j in refused) + len(passed) >= N_VALIDATED:
                 break
+            if unlike:
+                left = state.attempt(partial(mean_excess, best.trial), best.labels)
+                if left is None:
+                    refused.append(replace(best, reason=NOT_EXAMINED))
+                more_than_chance = by_chance(best.trial.n_samples)
+                if left is None or any(left + more_than_chance >= mean_excess(trial) for trial in unlike):
+                    continue  # what explains no more is no better a name for this heat
+            own, resembles = examined(i)
+            if own.reason:
+                refused.append(own)
+                if resembles:
+                    unlike.append(own.trial)
+            else:
+                passed.append(own)
+                if is_free or stands(state.trial, own.trial):
+                    break
     state.rejected += refused
     if not passed:
         state.rejected += weak
@@ -235,6 +247,29 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     state.findings.append(Finding(named, tuple(j for j in others if is_close(j, named))))
     state.trial = named.trial
     return True
+
+
+@contextmanager
+def _examined(
+    state: Search, options: Sequence[Judged], needed: float
+) -> Iterator[Callable[[int], tuple[Judged, bool]]]:
+    """Hand out what :func:`examine` returns of each option: the first alone, as it mostly passes, then more side by side."""
+    simple = state.trial
+
+    def apart(option: Judged) -> tuple[tuple[Judged, bool], dict[str, Any]]:
+        return examine(simple, option, needed), known(option.trial)
+
+    with state.attempts_ahead([(partial(apart, j), j.labels) for j in options[1:]]) as told:
+
+        def result(i: int) -> tuple[Judged, bool]:
+            if i == 0:
+                examined = state.attempt(partial(examine, simple, options[0], needed), options[0].labels)
+            else:
+                examined, learnt = told(i - 1) or (None, {})
+                keep(options[i].trial, learnt)
+            return examined or (replace(options[i], reason=NOT_EXAMINED), False)
+
+        yield result
 
 
 def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:

@@ -44,5 +44,15 @@ def ask_each(*questions: Callable[[], Any]) -> None:
         question.__self__.__dict__[key] = value
 
 
+def known(thing: Any) -> dict[str, Any]:
+    """Return the costly values of an object that have been computed."""
+    return {key: value for key, value in vars(thing).items() if key.startswith(_key("")) and not key.endswith("_lock")}
+
+
+def keep(thing: Any, values: dict[str, Any]) -> None:
+    """Let an object know costly values that were computed of it elsewhere."""
+    vars(thing).update({key: value for key, value in values.items() if key not in vars(thing)})
+
+
 def _key(name: str) -> str:
     return f"_once_{name}"
