@@ -167,15 +167,23 @@ class ProcessPerTask(Tasks):
 
 
 def resident_MiB(process: int) -> float:
-    """Return the memory that a process and those forked from it have in use, what they share once; 0 where nobody can tell."""
+    """Return the memory that a process and those forked from it have in use; 0 where nobody can tell.
+
+    What they share counts once where the system tells it (proportional set size), else for each of them.
+    """
     folder = Path("/proc", str(process))
-    try:
-        rollup = (folder / "smaps_rollup").read_text()
-        forked = [int(child) for told in folder.glob("task/*/children") for child in told.read_text().split()]
-    except OSError:
-        return 0.0
-    found = re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE)
+    forked = [int(child) for told in folder.glob("task/*/children") for child in _text(told).split()]
+    memory = _text(folder / "smaps_rollup") or _text(folder / "status")
+    found = re.search(r"^(?:Pss|VmRSS):\s+(\d+) kB", memory, re.MULTILINE)
     return (int(found[1]) / 1024 if found else 0.0) + sum(map(resident_MiB, forked))
+
+
+def _text(path: Path) -> str:
+    """Return what a file holds; nothing where it is not there, or its process has ended."""
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
 
 
 _CONTEXT = multiprocessing.get_context("spawn")

@@ -10,7 +10,8 @@ import httpx
 import numpy as np
 import pytest
 
-from service.jobs.executor import NICENESS, JobFailed, ProcessPerTask, Task
+from service.jobs import executor as executor_module
+from service.jobs.executor import NICENESS, JobFailed, ProcessPerTask, Task, resident_MiB
 from tests.service.conftest import SPEC
 from tests.service.server import FAKE, Server
 from twin_core import side_by_side
@@ -39,6 +40,16 @@ def hoarding(folder: str, *, progress: Callable[[float, str], None]) -> list[flo
     """Hold 1000 MiB in two forked processes."""
     side_by_side.n_cores = lambda: 2
     return side_by_side.side_by_side([partial(hoard, f"{folder}/{i}") for i in range(2)])
+
+
+@pytest.mark.parametrize("told", [("smaps_rollup", "status"), ("status",)])
+def test_the_memory_of_a_process_is_known_on_any_linux(monkeypatch: pytest.MonkeyPatch, told: tuple[str, ...]) -> None:
+    """Sandboxes and old kernels have no proportional sizes."""
+    whole = executor_module._text
+    monkeypatch.setattr(executor_module, "_text", lambda path: whole(path) if path.name in told else "")
+    held = np.ones(50 * 2**17)
+    assert resident_MiB(os.getpid()) > held.nbytes / 2**20
+    assert resident_MiB(2**22 + 1) == 0.0  # nobody's number
 
 
 @pytest.mark.skipif(not side_by_side.CAN_FORK, reason="this system does not fork safely")

@@ -114,6 +114,7 @@ def standing_out_s(survey: Survey, node: str) -> list[float]:
     seen = (frequency * (grid_s[-1] - grid_s[0]) >= LEAST_PERIODS) & (frequency * step <= 1.0 / SAMPLES_PER_PERIOD)
     found: list[int] = []
     for spectrum in (power, power * frequency**2):
+        # Peaks by hand: scipy.signal loads scipy.stats, half a second that few need.
         looked_at = np.where(seen, spectrum, 0.0)
         inner = looked_at[1:-1]
         peaks = 1 + np.flatnonzero((inner > looked_at[:-2]) & (inner >= looked_at[2:]))
