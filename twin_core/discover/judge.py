@@ -34,7 +34,6 @@ SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters 
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
-UNDECIDED = "a likelier effect, whose size the record does not determine, leaves nothing for it to explain"
 OUTDONE = "another effect in its place explains the readings better"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"

@@ -58,9 +58,7 @@ THRESHOLDS: dict[str, Threshold] = {
     "DOMINANCE": Threshold(
         "ratio",
         "a name explains so many times what a lumped network may leave beside it, times so many times the share of variance that"
-        " it leaves of what it was not fitted to where that is below one, and leaves no so many times what a likelier effect"
-        " leaves whose size is not determined; weighed by trajectories alone it leaves less of the error on what it was not"
-        " fitted to than one part in so many of what other names leave",
+        " it leaves of what it was not fitted to where that is below one",
         "a name that explains less than what stays could be the same coarseness; twice tells them apart within a factor sqrt 2",
         0.0,
         1.0,

@@ -12,18 +12,14 @@ from twin_core.discover.coarseness import by_chance, least_explained, times_aske
 from twin_core.discover.confirm import (
     Trial,
     mean_excess,
-    resettled,
     try_effects,
     validate,
     weigh,
-    weigh_trajectories,
 )
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_MORE,
-    NOT_SUPPORTED,
     OUTDONE,
-    SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     Finding,
     Judged,
@@ -31,10 +27,9 @@ from twin_core.discover.judge import (
     Without,
     examine,
     foresight_of,
-    once_each,
     worth,
 )
-from twin_core.effects.base import Effect, touched_nodes
+from twin_core.effects.base import Effect
 from twin_core.side_by_side import side_by_side
 
 N_EXCHANGED = 2
@@ -104,63 +99,6 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
         return
     state.rejected.append(examined[0])
     _drop(state, places, *without)
-
-
-def exchange(state: Search, refused: Sequence[Judged], needed: float) -> bool:
-    """Put an effect that was refused beside a finding in its place, if both act there and it explains more; False if none does.
-
-    The first look may take a part of what is missing for the whole: a heater that came on once for a load with an onset. What
-    switches it off again is then tried beside it, where it does not belong.
-    """
-    layout = state.trial.fit.network.layout
-    for option in sorted(refused, key=worth)[:N_EXCHANGED]:
-        for finding in state.findings:
-            here, there = ({n for e in j.effects for n in touched_nodes(e, layout)} for j in (option, finding.judged))
-            if here & there and len(option.effects) == 1 and worth(option) < worth(finding.judged):
-                replaced = partial(_in_place_of, state, finding, option, needed)
-                if state.attempt(replaced, f"{option.labels} in place of {finding.judged.labels}"):
-                    return True
-    return False
-
-
-def is_undecided(state: Search, refused: Sequence[Judged], needed: float) -> bool:
-    """Return whether the last finding explains a part of what a likelier option explains that was refused for its size alone.
-
-    The readings speak against the finding, then: that the other one cannot be told in watts makes it no less likely. A finding
-    that explains as much is another matter: what repeats as an input does, say, stands for anything that the input drives.
-
-    Parameters
-    ----------
-    state
-        With the finding.
-    refused
-        What was tried beside it, on top of the same model.
-    needed
-        Log Bayes factor that is asked for: by so much the other one must be likelier, and the finding must add beside it.
-    """
-    undetermined = [j for j in refused if j.reason == SIZE_NOT_DETERMINED]
-    if not undetermined:
-        return False
-    found = state.findings[-1].judged
-    left = mean_excess(state.trial)
-    own = {effect.place for effect in found.effects}
-    likelier = [
-        j
-        for j in undetermined
-        if worth(j) < worth(found) - needed
-        and policy.DOMINANCE * mean_excess(j.trial) < left
-        and own.isdisjoint(effect.place for effect in j.effects)
-    ]
-
-    def gain(option: Judged) -> float:
-        both = try_effects(option.trial, (*option.trial.effects, *found.effects), n_passes=12)
-        return weigh(option.trial, both, 1).log_bayes_factor
-
-    for option in sorted(likelier, key=worth)[:N_EXCHANGED]:
-        added = state.attempt(partial(gain, option), f"{found.labels} beside {option.labels}")
-        if added is not None and added <= needed:
-            return True
-    return False
 
 
 def _in_place_of(
@@ -248,63 +186,6 @@ def reconsider(state: Search, needed: float) -> None:
             instead.rejected += [replace(f.judged, reason=OUTDONE) for f in named]
             state.join(instead)
             return
-
-
-def name_what_foretells(state: Search, needed: float) -> None:
-    """Name a single effect that foretells what nothing that was found does, and tell beside it those that explain as much.
-
-    Heat that wanders stands for whatever lasts a while, such as a load that came on half-way: where a coarse network makes it
-    large, evidence beside it tells no such effect, though open-loop trajectories without the effect are far off; or it tells
-    another one that explains a part of it. There it is weighed by trajectories alone, must leave less of the error on what it
-    was not fitted to than one part in ``DOMINANCE`` of what the declared model leaves, or the names that were found, and no more
-    misfit than these or a coarse network may. What was found stays where it would be withdrawn.
-    """
-    if state.left_out or any(effect.fallback for finding in state.findings for effect in finding.effects):
-        return
-    weak = [j for j in state.rejected if j.reason == NOT_SUPPORTED and not any(e.fallback for e in j.effects)]
-    single = [j for j in weak if len(j.effects) == len(j.trial.effects) == 1]
-    if not single:
-        return
-
-    def found() -> tuple[float, float] | None:
-        left = mean_excess(state.trial)
-        if left <= by_chance(state.trial.n_samples):
-            return None  # nothing is missing beside it
-        foresight = validate(state.base, state.trial).foresight if state.findings else 1.0
-        return foresight, min(left, policy.MOST_COARSENESS)
-
-    def weighed(option: Judged) -> Judged:
-        evidence = weigh_trajectories(state.base, option.trial, max(state.n_named, 1))
-        return replace(option, evidence=evidence, reason="")
-
-    def examined(option: Judged) -> tuple[Judged, float] | None:
-        settled = resettled(state.base, option.trial)
-        if not policy.DOMINANCE * validate(state.base, settled).foresight < foresight:
-            return None  # whether it is a law takes far longer to tell
-        told = examine(state.base, replace(option, trial=settled, effects=settled.effects), needed)[0]
-        return told, mean_excess(settled)
-
-    so_far = state.attempt(found, "what was found foretells")
-    if so_far is None:
-        return
-    foresight, most_left = so_far
-    asked = (state.attempt(partial(weighed, j), j.labels) for j in single)
-    likely = once_each([j for j in asked if j is not None and j.evidence.log_bayes_factor > needed])
-    seen = filter(None, [state.attempt(partial(examined, j), j.labels) for j in likely[:N_RECONSIDERED]])
-    told = [(j, left) for j, left in seen if not j.reason]
-    left_by = {j.places: left for j, left in told if left <= most_left}
-    if not left_by:
-        return
-    share, least = policy.REPEATABLE_SHARE, min(left_by.values())
-    most = least + share * (mean_excess(state.base) - least)
-    best, *others = sorted((j for j, _ in told if left_by.get(j.places, np.inf) <= most), key=foresight_of)
-    named = {j.places for j in (best, *others)}
-    rest = [j for j in state.rejected if j.places not in named]
-    rest += [replace(finding.judged, reason=OUTDONE) for finding in state.findings]
-    instead = replace(state, trial=best.trial, findings=[Finding(best, tuple(others))], rejected=rest)
-    withdraw(instead, needed)
-    if instead.findings:
-        state.join(instead)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

@@ -20,7 +20,6 @@ from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
     SIZE_NOT_DETERMINED,
-    UNDECIDED,
     Judged,
     Search,
     accept,
@@ -28,15 +27,7 @@ from twin_core.discover.judge import (
     threshold,
     worth,
 )
-from twin_core.discover.revision import (
-    exchange,
-    is_undecided,
-    name_what_foretells,
-    prune,
-    reconsider,
-    tell_alternatives,
-    withdraw,
-)
+from twin_core.discover.revision import prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import (
@@ -111,18 +102,10 @@ def search(
         progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
         _converge(state)
         state.past = (*state.past, state.trial)
-        before, known = state.fork(), _places(state)
+        known = _places(state)
         with state.until(looking):
-            extended = _extend(state, needed, fallback=False)
-        refused, before.rejected = state.rejected[len(before.rejected) :], list(state.rejected)
-        if exchange(before, refused, needed):
-            state.join(before)
-        elif not extended:
-            break
-        elif is_undecided(state, refused, needed):
-            before.rejected.append(replace(state.findings[-1].judged, reason=UNDECIDED))
-            state.join(before)
-            break
+            if not _extend(state, needed, fallback=False):
+                break
         complete(state, needed)
         _converge(state)
         prune(state, needed)
@@ -134,7 +117,6 @@ def search(
         with state.until(looking):
             _extend(state, needed, fallback=True)
         withdraw(state, needed)
-    name_what_foretells(state, needed)
     reconsider(state, needed)
     progress(0.95, "comparing what was found with other names")
     tell_alternatives(state, needed)

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any, cast
 
 import pytest
 
@@ -25,7 +23,6 @@ from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_LAW,
     NO_MORE,
-    NOT_SUPPORTED,
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
@@ -40,9 +37,6 @@ from twin_core.discover.policy import (
     THRESHOLDS,
 )
 from twin_core.discover.revision import (
-    exchange,
-    is_undecided,
-    name_what_foretells,
     prune,
     reconsider,
     tell_alternatives,
@@ -328,195 +322,9 @@ def test_what_stands_in_part_only_gives_way_to_what_stands_whole(monkeypatch: py
     assert pair in state.rejected and single not in state.rejected
 
 
-JUST_FORETELLS = 1.0 / DOMINANCE - JUST
-
-
-@pytest.mark.parametrize(
-    ("options", "nats", "names", "others"),
-    [
-        ([judged("a", -90.0, foresight=JUST_FORETELLS)], {"a": 200.0}, ["a"], []),
-        ([judged("a", -90.0, foresight=1.0 / DOMINANCE)], {"a": 200.0}, [], []),
-        ([judged("a", -90.0, foresight=0.1)], {"a": NEEDED}, [], []),
-        ([judged("no law", -90.0, foresight=0.1)], {"no law": 200.0}, [], []),
-        ([judged("a", -9.0, foresight=0.3), judged("b", -9.0, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], ["a"]),
-        ([judged("a", -9.0), judged("b", -9.0, left=MOST, foresight=0.2)], {"a": 9.0, "b": 8.0}, ["b"], []),
-        ([judged("a", -9.0, left=MOST + JUST, foresight=0.1)], {"a": 200.0}, [], []),
-        (
-            [judged("a", -9.0, foresight=0.3), judged("b", -9.0, left=3.0 + JUST, foresight=0.2)],
-            {"a": 9.0, "b": 8.0},
-            ["a"],
-            [],
-        ),
-        ([replace(judged("a", -9.0, foresight=0.1), effects=(unnamed(),))], {}, [], []),
-        ([replace(judged("a", 9.0, foresight=0.1), reason=NO_MORE)], {"a": 9.0}, [], []),
-    ],
-    ids=[
-        "foretells",
-        "not enough",
-        "trajectories hardly likelier",
-        "no law",
-        "explains as much and foretells better",
-        "foretells what a likelier one does not",
-        "leaves more than coarseness",
-        "explains less, so is no alternative",
-        "has no name",
-        "was refused for something else",
-    ],
-)
-def test_what_foretells_is_named_where_wandering_heat_is_as_likely(
-    monkeypatch: pytest.MonkeyPatch, options: list[Judged], nats: dict[str, float], names: list[str], others: list[str]
-) -> None:
-    """The declared model leaves thirty noise variances, of which three are a tenth."""
-
-    def node(trial: Trial) -> str:
-        return str(trial.effects[0].where["node"])
-
-    monkeypatch.setattr(revision, "weigh_trajectories", lambda simple, rich, n: Evidence(nats[node(rich)], 0.0))
-    monkeypatch.setattr(revision, "resettled", lambda simple, rich: rich)
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    monkeypatch.setattr(
-        revision,
-        "examine",
-        lambda simple, option, needed: (
-            replace(option, reason=NO_LAW if node(option.trial) == "no law" else ""),
-            False,
-        ),
-    )
-    state = Search(stub(left=30.0), stub(left=30.0))
-    state.rejected = [replace(j, reason=j.reason or NOT_SUPPORTED) for j in options]
-    before = list(state.rejected)
-    name_what_foretells(state, NEEDED)
-    assert [e.where["node"] for f in state.findings for e in f.effects] == names
-    assert [j.effects[0].where["node"] for f in state.findings for j in f.alternatives] == others
-    told = {*names, *others}
-    assert state.rejected == [j for j in before if j.effects[0].fallback or j.effects[0].where["node"] not in told]
-    assert [e.where["node"] for e in state.trial.effects] == names
-
-
-@pytest.mark.parametrize(
-    ("foresight", "left", "replaced"),
-    [
-        (0.35 - JUST, 1.0, True),
-        (0.35, 1.0, False),
-        (0.1, 1.0 + JUST, False),
-    ],
-    ids=["leaves half the error", "no more than a finding's", "leaves more than the finding"],
-)
-def test_what_foretells_replaces_names_that_do_not(
-    monkeypatch: pytest.MonkeyPatch, foresight: float, left: float, replaced: bool
-) -> None:
-    """The finding leaves 0.7 of the error on what it was not fitted to, and one noise variance."""
-    monkeypatch.setattr(revision, "weigh_trajectories", lambda simple, rich, n: Evidence(200.0, 0.0))
-    monkeypatch.setattr(revision, "resettled", lambda simple, rich: rich)
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, option, needed: (option, False))
-    found = judged("f", 90.0)
-    option = judged("a", -90.0, left=left, foresight=foresight)
-    state = Search(stub(load("f"), left=1.0, foresight=0.7), stub(left=30.0), findings=[Finding(found)])
-    state.rejected = [replace(option, reason=NOT_SUPPORTED)]
-    name_what_foretells(state, NEEDED)
-    assert [e.where["node"] for f in state.findings for e in f.effects] == (["a"] if replaced else ["f"])
-    assert [e.where["node"] for e in state.trial.effects] == (["a"] if replaced else ["f"])
-    assert [j.reason for j in state.rejected] == ([OUTDONE] if replaced else [NOT_SUPPORTED])
-
-
-def test_what_would_be_withdrawn_replaces_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The finding stays where what foretells better explains too little beside what stays."""
-    monkeypatch.setattr(revision, "weigh_trajectories", lambda simple, rich, n: Evidence(200.0, 0.0))
-    monkeypatch.setattr(revision, "resettled", lambda simple, rich: rich)
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, option, needed: (option, False))
-    weak = replace(judged("a", -90.0, left=1.0, foresight=0.3), reason=NOT_SUPPORTED)
-    state = Search(
-        stub(load("f"), left=1.0, foresight=0.9), stub(left=1.0 + JUST), findings=[Finding(judged("f", 9.0))]
-    )
-    state.rejected = [weak]
-    name_what_foretells(state, NEEDED)
-    assert [e.where["node"] for f in state.findings for e in f.effects] == ["f"]
-    assert [e.where["node"] for e in state.trial.effects] == ["f"]
-    assert state.rejected == [weak]
-
-
-def test_trajectories_alone_are_not_asked_beside_heat_without_a_name_or_a_fit_to_the_noise_or_where_time_ran_out(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(revision, "weigh_trajectories", lambda *_: pytest.fail("nobody should ask"))
-    weak = replace(judged("a", -9.0, foresight=0.1), reason=NOT_SUPPORTED)
-    found = judged("f", 9.0)
-    free = Finding(replace(found, effects=(unnamed(),)))
-    to_the_noise = stub(load("f"), left=CHANCE, foresight=0.9)
-    for state in (
-        Search(stub(left=9.0), stub(left=9.0), findings=[free], rejected=[weak]),
-        Search(to_the_noise, stub(left=9.0), findings=[Finding(found)], rejected=[weak]),
-        Search(stub(left=9.0), stub(left=9.0), left_out=["b"], rejected=[weak]),
-    ):
-        name_what_foretells(state, NEEDED)
-        assert state.rejected == [weak]
-
-
 def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
     effect = REGISTRY[kind]({"node": node}, {})
     return Judged((effect,), Evidence(nats, 0.0), stub(effect), None, reason)
-
-
-@pytest.mark.parametrize(
-    ("option", "alone", "reason", "named"),
-    [
-        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED + JUST, "", "thermostat_heater"),
-        (kind_at("thermostat_heater", "n0", 90.0), 30.0 + NEEDED, "", "heat_load_step"),
-        (kind_at("thermostat_heater", "n0", 90.0), 99.0, NO_LAW, "heat_load_step"),
-        (kind_at("thermostat_heater", "n0", 20.0), 99.0, "", "heat_load_step"),
-        (kind_at("thermostat_heater", "n1", 90.0), 99.0, "", "heat_load_step"),
-    ],
-    ids=["explains more", "hardly more", "is no law", "was worth less beside it", "acts elsewhere"],
-)
-def test_what_was_refused_beside_a_finding_may_stand_in_its_place(
-    monkeypatch: pytest.MonkeyPatch, option: Judged, alone: float, reason: str, named: str
-) -> None:
-    monkeypatch.setattr(revision, "touched_nodes", lambda effect, layout: {effect.where["node"]})
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 30.0))
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
-    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
-    found = kind_at("heat_load_step", "n0", 30.0)
-    cast(Any, found.trial.fit).network = SimpleNamespace(layout=None)
-    refused = replace(option, reason=NO_FORESIGHT)
-    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[refused])
-    assert exchange(state, [refused], NEEDED) == (named != "heat_load_step")
-    assert [f.effects[0].name for f in state.findings] == [named] == [e.name for e in state.trial.effects]
-    assert [j.reason for j in state.rejected] == ([NO_FORESIGHT] if named == "heat_load_step" else [OUTDONE])
-
-
-@pytest.mark.parametrize(
-    ("nats", "reason", "node", "left", "added", "undecided"),
-    [
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED, True),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0 + JUST, NEEDED + JUST, False),
-        (30.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, "n1", 2.0, NEEDED, False),
-        (30.0 + NEEDED, SIZE_NOT_DETERMINED, "n1", 9.0, 0.0, False),
-        (90.0, NO_FORESIGHT, "n1", 9.0, 0.0, False),
-        (90.0, SIZE_NOT_DETERMINED, "n0", 9.0, 0.0, False),
-    ],
-    ids=["explains it", "leaves some", "explains no less", "hardly likelier", "predicts nothing", "is the same"],
-)
-def test_a_name_that_adds_nothing_to_a_likelier_one_of_unknown_size_is_none(
-    monkeypatch: pytest.MonkeyPatch, nats: float, reason: str, node: str, left: float, added: float, undecided: bool
-) -> None:
-    """The other one leaves one noise variance, the finding more."""
-    weighed: list[tuple[Trial, Trial]] = []
-
-    def weigh(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-        weighed.append((simple, rich))
-        return Evidence(added, 0.0)
-
-    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
-    monkeypatch.setattr(revision, "weigh", weigh)
-    found, option = kind_at("constant_heat_load", "n0", 30.0), kind_at("constant_heat_load", node, nats, reason)
-    option = replace(option, trial=stub(*option.effects, left=1.0))
-    state = Search(stub(*found.effects, left=left), stub(), findings=[Finding(found)])
-    assert is_undecided(state, [option], NEEDED) == undecided
-    for simple, rich in weighed:
-        assert simple is option.trial and [e.where["node"] for e in rich.effects] == [node, "n0"]
 
 
 @pytest.mark.parametrize(
