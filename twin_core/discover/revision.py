@@ -102,17 +102,12 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
 
 
 def _in_place_of(
-    state: Search,
-    finding: Finding,
-    option: Judged,
-    needed: float,
-    margin: float | None = None,
-    foresight: float = np.inf,
+    state: Search, finding: Finding, option: Judged, needed: float, margin: float, foresight: float
 ) -> bool:
     """Take an option instead of a finding, if it is likelier by a margin and passes; return whether it did.
 
-    The margin is the odds asked for unless it is given; supported by these the option must be in any case. Its error on what it
-    was not fitted to must be below ``foresight`` times that of the finding.
+    Supported by the odds asked for the option must be in any case. Its error on what it was not fitted to must be below
+    ``foresight`` times that of the finding.
     """
     places = finding.judged.places
     kept = _attempted_without(state, places)
@@ -121,7 +116,7 @@ def _in_place_of(
     without, lost = kept
     trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
     instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
-    if instead.evidence.log_bayes_factor <= max(needed, lost + (needed if margin is None else margin)):
+    if instead.evidence.log_bayes_factor <= max(needed, lost + margin):
         return False
     examined, _ = examine(without, instead, needed)
     if examined.reason:
