@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -30,6 +30,19 @@ from twin_core.holdout import predict, split_fraction
 
 HOLDOUT = 0.3
 RESULTS = Path("build/loop.jsonl")
+
+
+class Named(Protocol):
+    """What one run is of: a name that is unique among all runs, and the group it is counted in."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def group(self) -> str: ...
+
+
+Run = TypeVar("Run", bound=Named)
 
 
 def place(row: dict[str, Any]) -> tuple[str, frozenset[Any]]:
@@ -111,7 +124,7 @@ def known_effect_trial(case: Case) -> Trial | None:
 
 
 def run_all(
-    tasks: Iterable[Task], results: Path, n_processes: int, work: Callable[[Task], Row], told: Callable[[Row], str]
+    tasks: Iterable[Run], results: Path, n_processes: int, work: Callable[[Run], Row], told: Callable[[Row], str]
 ) -> list[Row]:
     """Run what the file of results lacks; return the rows of all the tasks. A case that fails is a row with its error.
 
