@@ -17,95 +17,116 @@ a thousand samples of seven sensors changes by less than a thousandth of a nat."
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_covariance(
-    full: FloatArray, cov: FloatArray, turned: FloatArray, keep: float, force: FloatArray, state: FloatArray
+    full: FloatArray,
+    cov: FloatArray,
+    turned: FloatArray,
+    own: FloatArray,
+    keep: float,
+    force: FloatArray,
+    state: FloatArray,
 ) -> None:
-    """Advance the covariance of [temperatures, heats]: the heats only decay, so that half of the product is cheap."""
-    both = cov.shape[0]
-    n = both // 2
+    """Advance the covariance of [temperatures, heats]: the heats only decay, so that half of the product is enough."""
+    n = full.shape[0]
+    np.dot(full, cov, turned)
+    np.dot(turned, full.T, own)
     for i in range(n):
-        for j in range(both):
-            turned[i, j] = 0.0
-        for m in range(both):
-            factor = full[i, m]
-            if factor != 0.0:
-                for j in range(both):
-                    turned[i, j] += factor * cov[m, j]
-    for i in range(n, both):
-        for j in range(i + 1):
-            if j >= n:
-                cov[i, j] *= keep * keep
-                cov[j, i] = cov[i, j]
-    for i in range(n):
-        for j in range(n, both):
-            cov[i, j] = turned[i, j] * keep
-            cov[j, i] = cov[i, j]
-        for j in range(i + 1):
-            total = 0.0
-            for m in range(both):
-                total += turned[i, m] * full[j, m]
-            cov[i, j] = total
-            cov[j, i] = total
-    for i in range(n):
+        for j in range(n):
+            cov[i, j] = own[i, j]
+            cov[i, n + j] = turned[i, n + j] * keep
+            cov[n + i, n + j] *= keep * keep
         cov[i, i] += state[i]
         cov[n + i, n + i] += force[i] * (1.0 - keep * keep)
+    for i in range(n):
+        for j in range(n):
+            cov[n + i, j] = cov[j, n + i]
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def _condition(
+    observed: IntArray,
+    noise: FloatArray,
+    valid: BoolArray,
+    cov: FloatArray,
+    fall: FloatArray,
+    gains: FloatArray,
+    roots: FloatArray,
+) -> float:
+    """Condition the covariance on the valid sensors, one after the other; return ln det of the innovations' covariance.
+
+    ``gains``, (n_sensors, 2 n), and ``roots`` are written: what a whitened innovation of each sensor adds to the mean, and the
+    deviation of its innovation given those of the sensors before it. Without a reading the gain is zero.
+    """
+    both, log_det = cov.shape[0], 0.0
+    for s in range(observed.size):
+        gain, o = gains[s], observed[s]
+        if not valid[s]:
+            gain[:] = 0.0
+            continue
+        for i in range(both):
+            gain[i] = cov[o, i]
+        for r in range(s):
+            share = gains[r, o]
+            for i in range(both):
+                gain[i] -= share * gains[r, i]
+        roots[s] = np.sqrt(gain[o] + noise[s])
+        log_det += 2.0 * np.log(roots[s])
+        for i in range(both):
+            gain[i] /= roots[s]
+    np.dot(gains.T, gains, fall)
+    for i in range(both):
+        for j in range(both):
+            cov[i, j] -= fall[i, j]
+    return log_det
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_columns(full: FloatArray, mean: FloatArray, work: FloatArray, keep: float) -> None:
     """Advance the mean of every column."""
-    both, n_columns = mean.shape
-    n = both // 2
+    n = full.shape[0]
+    np.dot(full, mean, work)
     for i in range(n):
-        for c in range(n_columns):
-            work[i, c] = 0.0
-        for j in range(both):
-            factor = full[i, j]
-            if factor != 0.0:
-                for c in range(n_columns):
-                    work[i, c] += factor * mean[j, c]
-    for i in range(n):
-        for c in range(n_columns):
+        for c in range(mean.shape[1]):
             mean[i, c] = work[i, c]
             mean[n + i, c] *= keep
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
-def _condition(o: int, noise: float, cov: FloatArray, gain: FloatArray) -> float:
-    """Condition the covariance on one sensor; write the gain; return the variance of the innovation."""
-    both = cov.shape[0]
-    variance = cov[o, o] + noise
-    for i in range(both):
-        gain[i] = cov[i, o] / variance
-    for i in range(both):
-        moved = gain[i] * variance
-        for j in range(both):
-            cov[i, j] -= moved * gain[j]
-    return variance
-
-
-@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _correct_columns(
-    o: int, root: float, gain: FloatArray, mean: FloatArray, reading: FloatArray, out: FloatArray
+    observed: IntArray,
+    valid: BoolArray,
+    gains: FloatArray,
+    roots: FloatArray,
+    mean: FloatArray,
+    change: FloatArray,
+    readings: FloatArray,
+    out: FloatArray,
 ) -> None:
-    """Correct the mean of every column by one reading; write whitened innovations."""
+    """Correct the mean of every column by the readings of one sample; write whitened innovations, (n_sensors, n_columns)."""
     both, n_columns = mean.shape
-    for c in range(n_columns):
-        out[c] = reading[c] - mean[o, c]
+    for s in range(observed.size):
+        if valid[s]:
+            o = observed[s]
+            for c in range(n_columns):
+                out[s, c] = readings[s, c] - mean[o, c]
+            for r in range(s):
+                share = gains[r, o]
+                for c in range(n_columns):
+                    out[s, c] -= share * out[r, c]
+            for c in range(n_columns):
+                out[s, c] /= roots[s]
+    np.dot(gains.T, out, change)
     for i in range(both):
         for c in range(n_columns):
-            mean[i, c] += gain[i] * out[c]
-    for c in range(n_columns):
-        out[c] /= root
+            mean[i, c] += change[i, c]
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _predict_column(full: FloatArray, mean: FloatArray, work: FloatArray, keep: float) -> None:
     """Advance a single mean, (2 n,): the columns' loop has nothing to run over, so that rows must."""
-    both = mean.size
-    n = both // 2
+    n = full.shape[0]
     for i in range(n):
         total = 0.0
-        for j in range(both):
+        for j in range(2 * n):
             total += full[i, j] * mean[j]
         work[i] = total
     for i in range(n):
@@ -116,10 +137,10 @@ def _predict_column(full: FloatArray, mean: FloatArray, work: FloatArray, keep: 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
 def _correct_column(o: int, root: float, gain: FloatArray, mean: FloatArray, reading: float) -> float:
     """Correct a single mean by one reading; return the whitened innovation."""
-    innovation = reading - mean[o]
+    innovation = (reading - mean[o]) / root
     for i in range(mean.size):
         mean[i] += gain[i] * innovation
-    return innovation / root
+    return innovation
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -184,28 +205,28 @@ def whiten_columns(
         Innovations over their standard deviation, zero where invalid; ln det of the covariance of the readings.
     """
     n_steps, n = kind.size, transition.shape[1]
-    out = np.zeros_like(columns)
-    cov, full, turned = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
-    before = np.zeros((2 * n, 2 * n))
-    mean, work = np.zeros((2 * n, columns.shape[2])), np.empty((n, columns.shape[2]))
-    only, own_work, is_single = np.zeros(2 * n), np.empty(n), columns.shape[2] == 1
-    gains, roots, logs = np.zeros((observed.size, 2 * n)), np.ones(observed.size), np.zeros(observed.size)
+    n_columns, out = columns.shape[2], np.zeros_like(columns)
+    cov, before, fall = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
+    full, turned, own = np.empty((n, 2 * n)), np.empty((n, 2 * n)), np.empty((n, n))
+    mean, change, work = np.zeros((2 * n, n_columns)), np.empty((2 * n, n_columns)), np.empty((n, n_columns))
+    only, own_work, is_single = np.zeros(2 * n), np.empty(n), n_columns == 1
+    gains, roots = np.zeros((observed.size, 2 * n)), np.ones(observed.size)
     for i in range(n):
         cov[i, i] = start_variance[i]
         cov[n + i, n + i] = force_variance[i]
-    log_det, last, settled, filled = 0.0, -1, -1, -1
+    log_det, here_log_det, last, settled, filled = 0.0, 0.0, -1, -1, -1
     for k in range(n_steps + 1):
         here = interval[k - 1] if k > 0 else -1
         frozen = here >= 0 and here == settled
         if k > 0:
             c = kind[k - 1]
             if c != filled:
-                full[:n, :n] = transition[c]
-                full[:n, n:] = response[c]
+                full[:, :n] = transition[c]
+                full[:, n:] = response[c]
                 filled = c
             if not frozen:
                 settled = -1
-                _predict_covariance(full, cov, turned, keep[c], force_variance, state_variance)
+                _predict_covariance(full, cov, turned, own, keep[c], force_variance, state_variance)
             if is_single:
                 _predict_column(full, only, own_work, keep[c])
             else:
@@ -213,22 +234,19 @@ def whiten_columns(
         row = sample_of[k]
         if row < 0:
             continue
-        for s in range(observed.size):
-            if valid[row, s]:
-                if not frozen:
-                    variance = _condition(observed[s], noise_variance[s], cov, gains[s])
-                    roots[s], logs[s] = np.sqrt(variance), np.log(variance)
-                log_det += logs[s]
-                if is_single:
-                    reading = columns[row, s, 0]
-                    out[row, s, 0] = _correct_column(observed[s], roots[s], gains[s], only, reading)
-                else:
-                    _correct_columns(observed[s], roots[s], gains[s], mean, columns[row, s], out[row, s])
         if not frozen:
+            here_log_det = _condition(observed, noise_variance, valid[row], cov, fall, gains, roots)
             if here >= 0 and here == last and _settled(cov, before):
                 settled = here
             before[:] = cov
             last = here
+        log_det += here_log_det
+        if not is_single:
+            _correct_columns(observed, valid[row], gains, roots, mean, change, columns[row], out[row])
+            continue
+        for s in range(observed.size):
+            if valid[row, s]:
+                out[row, s, 0] = _correct_column(observed[s], roots[s], gains[s], only, columns[row, s, 0])
     return out, log_det
 
 
