@@ -9,11 +9,13 @@ and B are those of the rollout's own scheme, so that what is fitted here holds a
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.gp.state_space import LinearModel
+from twin_core.latent_force.size_score import size_score
 from twin_core.latent_force.whitening import whiten_columns
 from twin_core.simulate.one_step import Steps
 
@@ -141,28 +143,47 @@ class HeldForce:
         grid
             How the steps repeat, where it is known already.
         """
-        grid = grid or grid_of(self.step_s, sample_of, valid)
-        transition, response = means
+        model = self._prepared(means, sample_of, valid, grid)
         parts, log_det = [], 0.0
         for first in range(0, max(columns.shape[2], 1), COLUMNS_AT_ONCE):
             some = columns[:, :, first : first + COLUMNS_AT_ONCE]
-            whitened, log_det = whiten_columns(
-                transition,
-                response,
-                np.exp(-grid.step_s / self.length_s),
-                grid.kind,
-                self.std_W**2,
-                self.floor_K2,
-                self.sensor_node,
-                self.noise_K**2,
-                self.start_std_K**2,
-                sample_of,
-                grid.interval,
-                valid,
-                np.ascontiguousarray(np.where(np.isnan(some), 0.0, some)),
-            )
+            whitened, log_det = whiten_columns(*model, _without_gaps(some))
             parts.append(whitened)
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2), log_det
+
+    def score(
+        self,
+        residual: FloatArray,
+        means: tuple[FloatArray, FloatArray],
+        sample_of: IntArray,
+        valid: BoolArray,
+        grid: Grid | None = None,
+    ) -> tuple[float, FloatArray]:
+        """Return the log-likelihood of (n_samples, n_sensors) residuals, less its constant, and its slope in ln ``std_W``.
+
+        The other parameters are those of :meth:`whiten`.
+        """
+        value, slope = size_score(*self._prepared(means, sample_of, valid, grid), _without_gaps(residual[:, :, None]))
+        return float(value), slope
+
+    def _prepared(
+        self, means: tuple[FloatArray, FloatArray], sample_of: IntArray, valid: BoolArray, grid: Grid | None
+    ) -> tuple[Any, ...]:
+        """Return what the compiled filter takes before the columns."""
+        grid = grid or grid_of(self.step_s, sample_of, valid)
+        return (
+            *means,
+            np.exp(-grid.step_s / self.length_s),
+            grid.kind,
+            self.std_W**2,
+            self.floor_K2,
+            self.sensor_node,
+            self.noise_K**2,
+            self.start_std_K**2,
+            sample_of,
+            grid.interval,
+            valid,
+        )
 
     def linear_model(self, steps: Steps, drift_K: FloatArray, prior_mean_K: FloatArray) -> LinearModel:
         """Return the same model for filter and smoother, with A, B, b (n_steps, n_nodes) and a mean of the start (n_nodes,)."""
@@ -185,3 +206,8 @@ class HeldForce:
             prior_cov=np.diag(np.concatenate([self.start_std_K**2, self.std_W**2])),
             n_times=n_steps + 1,
         )
+
+
+def _without_gaps(columns: FloatArray) -> FloatArray:
+    """Return columns with zeros where there are no readings, laid out as the compiled filter takes them."""
+    return np.ascontiguousarray(np.where(np.isnan(columns), 0.0, columns))

@@ -144,7 +144,7 @@ def _correct_column(o: int, root: float, gain: FloatArray, mean: FloatArray, rea
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _settled(cov: FloatArray, before: FloatArray) -> bool:
+def is_settled(cov: FloatArray, before: FloatArray) -> bool:
     """Return whether a covariance has stopped moving: by less than ``SETTLED`` in units of its deviations."""
     for i in range(cov.shape[0]):
         for j in range(i + 1):
@@ -154,6 +154,80 @@ def _settled(cov: FloatArray, before: FloatArray) -> bool:
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract"}, error_model="numpy")
+def filtered(
+    transition: FloatArray,
+    response: FloatArray,
+    keep: FloatArray,
+    kind: IntArray,
+    force_variance: FloatArray,
+    state_variance: FloatArray,
+    observed: IntArray,
+    noise_variance: FloatArray,
+    start_variance: FloatArray,
+    sample_of: IntArray,
+    interval: IntArray,
+    valid: BoolArray,
+    columns: FloatArray,
+    gains_of: FloatArray,
+    roots_of: FloatArray,
+    gain_at: IntArray,
+) -> tuple[FloatArray, float]:
+    """Do what :func:`whiten_columns` says; keep what an adjoint needs, unless ``gain_at`` is empty.
+
+    Gains and deviations, as ``_condition`` writes them, of every sample at which they are new; for each sample which these are.
+    """
+    n_steps, n = kind.size, transition.shape[1]
+    n_columns, out = columns.shape[2], np.zeros_like(columns)
+    cov, before, fall = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
+    full, turned, own = np.empty((n, 2 * n)), np.empty((n, 2 * n)), np.empty((n, n))
+    mean, change, work = np.zeros((2 * n, n_columns)), np.empty((2 * n, n_columns)), np.empty((n, n_columns))
+    only, own_work, is_single = np.zeros(2 * n), np.empty(n), n_columns == 1
+    gains, roots = np.zeros((observed.size, 2 * n)), np.ones(observed.size)
+    for i in range(n):
+        cov[i, i] = start_variance[i]
+        cov[n + i, n + i] = force_variance[i]
+    log_det, here_log_det, last, settled, filled, n_kept = 0.0, 0.0, -1, -1, -1, 0
+    for k in range(n_steps + 1):
+        here = interval[k - 1] if k > 0 else -1
+        frozen = here >= 0 and here == settled
+        if k > 0:
+            c = kind[k - 1]
+            if c != filled:
+                full[:, :n] = transition[c]
+                full[:, n:] = response[c]
+                filled = c
+            if not frozen:
+                settled = -1
+                _predict_covariance(full, cov, turned, own, keep[c], force_variance, state_variance)
+            if is_single:
+                _predict_column(full, only, own_work, keep[c])
+            else:
+                _predict_columns(full, mean, work, keep[c])
+        row = sample_of[k]
+        if row < 0:
+            continue
+        if not frozen:
+            here_log_det = _condition(observed, noise_variance, valid[row], cov, fall, gains, roots)
+            if here >= 0 and here == last and is_settled(cov, before):
+                settled = here
+            before[:] = cov
+            last = here
+            if gain_at.size:
+                gains_of[n_kept], roots_of[n_kept] = gains, roots
+                n_kept += 1
+        if gain_at.size:
+            gain_at[row] = n_kept - 1
+        log_det += here_log_det
+        if not is_single:
+            _correct_columns(observed, valid[row], gains, roots, mean, change, columns[row], out[row])
+            continue
+        for s in range(observed.size):
+            if valid[row, s]:
+                out[row, s, 0] = _correct_column(observed[s], roots[s], gains[s], only, columns[row, s, 0])
+    return out, log_det
+
+
+@njit(cache=True, nogil=True)
 def whiten_columns(
     transition: FloatArray,
     response: FloatArray,
@@ -204,50 +278,23 @@ def whiten_columns(
     (n_samples, n_sensors, n_columns), float
         Innovations over their standard deviation, zero where invalid; ln det of the covariance of the readings.
     """
-    n_steps, n = kind.size, transition.shape[1]
-    n_columns, out = columns.shape[2], np.zeros_like(columns)
-    cov, before, fall = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n)), np.empty((2 * n, 2 * n))
-    full, turned, own = np.empty((n, 2 * n)), np.empty((n, 2 * n)), np.empty((n, n))
-    mean, change, work = np.zeros((2 * n, n_columns)), np.empty((2 * n, n_columns)), np.empty((n, n_columns))
-    only, own_work, is_single = np.zeros(2 * n), np.empty(n), n_columns == 1
-    gains, roots = np.zeros((observed.size, 2 * n)), np.ones(observed.size)
-    for i in range(n):
-        cov[i, i] = start_variance[i]
-        cov[n + i, n + i] = force_variance[i]
-    log_det, here_log_det, last, settled, filled = 0.0, 0.0, -1, -1, -1
-    for k in range(n_steps + 1):
-        here = interval[k - 1] if k > 0 else -1
-        frozen = here >= 0 and here == settled
-        if k > 0:
-            c = kind[k - 1]
-            if c != filled:
-                full[:, :n] = transition[c]
-                full[:, n:] = response[c]
-                filled = c
-            if not frozen:
-                settled = -1
-                _predict_covariance(full, cov, turned, own, keep[c], force_variance, state_variance)
-            if is_single:
-                _predict_column(full, only, own_work, keep[c])
-            else:
-                _predict_columns(full, mean, work, keep[c])
-        row = sample_of[k]
-        if row < 0:
-            continue
-        if not frozen:
-            here_log_det = _condition(observed, noise_variance, valid[row], cov, fall, gains, roots)
-            if here >= 0 and here == last and _settled(cov, before):
-                settled = here
-            before[:] = cov
-            last = here
-        log_det += here_log_det
-        if not is_single:
-            _correct_columns(observed, valid[row], gains, roots, mean, change, columns[row], out[row])
-            continue
-        for s in range(observed.size):
-            if valid[row, s]:
-                out[row, s, 0] = _correct_column(observed[s], roots[s], gains[s], only, columns[row, s, 0])
-    return out, log_det
+    nothing = np.empty((0, 0, 0)), np.empty((0, 0)), np.empty(0, dtype=np.int64)
+    return filtered(
+        transition,
+        response,
+        keep,
+        kind,
+        force_variance,
+        state_variance,
+        observed,
+        noise_variance,
+        start_variance,
+        sample_of,
+        interval,
+        valid,
+        columns,
+        *nothing,
+    )
 
 
 @njit(cache=True, nogil=True)

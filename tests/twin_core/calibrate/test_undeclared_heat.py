@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from scipy.optimize import minimize as minimise_by_simplex
 from scipy.stats import multivariate_normal
 
 from tests.analytic import laplacian, linear_states
@@ -195,6 +196,19 @@ def test_nothing_is_made_up_where_nothing_is_missing() -> None:
     fit = fit_with_undeclared_heat(problem)
     assert np.abs(log_errors(problem, fit.values, truth)).max() < 0.05
     assert fit.undeclared.std_W.max() < 1.0
+
+
+def test_no_other_size_of_the_heat_is_much_likelier() -> None:
+    """The quasi-Newton passes end where a simplex search, which knows no slope, finds nothing more."""
+    problem, _ = three_nodes(2, 20.0)
+    fit = fit_with_undeclared_heat(problem)
+
+    def cost(log_sizes: np.ndarray) -> float:
+        size = UndeclaredHeat(fit.undeclared.std_W * np.exp(log_sizes[:3]), fit.undeclared.length_s)
+        return -log_likelihood(problem, size, fit.nominals)
+
+    best = minimise_by_simplex(cost, np.zeros(3), method="Nelder-Mead", options={"maxiter": 300}).fun
+    assert -best < fit.log_likelihood + 0.2
 
 
 def test_a_fit_never_ends_below_where_it_started() -> None:

@@ -25,7 +25,7 @@ from twin_core.calibrate.undeclared.model import (
     states_of,
     whiten,
 )
-from twin_core.calibrate.undeclared.size import LARGEST_LOG_STEP, SizeSearch, first_size, new_search
+from twin_core.calibrate.undeclared.size import SizeSearch, first_size
 
 EARLY_PRIOR_STD = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 """Prior deviations of logarithmic parameters in the first passes, while the undeclared heat is still too large."""
@@ -46,7 +46,10 @@ LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
 
 SETTLED_NATS, SETTLED_LOG_STEP = 0.2, 0.3
-"""A pass that adds less than this to the log-likelihood, with steps of sizes this small, is the last."""
+"""A pass that adds less than this to the log-likelihood, with steps of the correlation length this small, is the last."""
+
+FIRST_LOG_STEP = 0.7
+"""First step of the correlation length, in ln."""
 
 
 def _first_guess(problem: Problem, segment: Segment) -> FloatArray:
@@ -155,7 +158,7 @@ def fit_with_undeclared_heat(
     values = parameters.to_values(free)
     if near is not None:
         nominals, undeclared = _carried_over(problem, values, near)
-        sizes = new_search(problem.n_nodes, 1.5)
+        sizes = SizeSearch(FIRST_LOG_STEP)
         return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, resized, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
@@ -167,7 +170,7 @@ def fit_with_undeclared_heat(
         if started and is_late(deadline):
             break
         fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
-        sizes = new_search(problem.n_nodes, LARGEST_LOG_STEP)
+        sizes = SizeSearch(FIRST_LOG_STEP)
         for most_std in early_prior_std:
             if is_late(deadline) and np.isfinite(fit.log_likelihood):
                 break
@@ -199,7 +202,7 @@ def _settle(
             break
         fit = _pass(fit, sizes, np.inf, resized=resized, still=refused >= MOST_REFUSED)
         refused = refused + 1 if np.array_equal(free, fit.free) else 0
-        small = (sizes.log_step[list(sizes.positions(resized))] < SETTLED_LOG_STEP).all()
+        small = resized is not None or sizes.log_step < SETTLED_LOG_STEP
         if fit.log_likelihood - before < SETTLED_NATS and small:
             break
     return fit

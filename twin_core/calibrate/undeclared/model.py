@@ -188,6 +188,25 @@ def log_likelihood(problem: Problem, undeclared: UndeclaredHeat, nominals: Seque
     return total if np.isfinite(total) else -np.inf
 
 
+def log_likelihood_and_slope(
+    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
+) -> tuple[float, FloatArray]:
+    """Return the log-likelihood of all segments, and its slope in ln of the size on each node, (n_nodes,).
+
+    Minus infinity, and no slope, where the linearisation ran away.
+    """
+    total, slope = 0.0, np.zeros(problem.n_nodes)
+    for nominal in nominals:
+        if not nominal.is_finite:
+            return -np.inf, np.zeros(problem.n_nodes)
+        force, valid = held_force(problem, undeclared, nominal), nominal.segment.valid
+        with np.errstate(over="ignore", invalid="ignore"):
+            value, part = force.score(nominal.residual_K, nominal.means, nominal.sample_of, valid, nominal.grid)
+        total += value - 0.5 * int(valid.sum()) * np.log(2.0 * np.pi)
+        slope += part
+    return (total, slope) if np.isfinite(total) else (-np.inf, np.zeros(problem.n_nodes))
+
+
 def gain_of_undeclared_heat(fit: HeatFit) -> float:
     """Return the log-likelihood that undeclared heat adds to a fit, in nats: next to nothing where nothing is missing."""
     none = UndeclaredHeat(np.full_like(fit.undeclared.std_W, NO_HEAT_W), fit.undeclared.length_s)

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import minimize
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
 from twin_core.calibrate.problem import Problem
-from twin_core.calibrate.undeclared.model import Nominal, UndeclaredHeat, log_likelihood
+from twin_core.calibrate.undeclared.model import Nominal, UndeclaredHeat, log_likelihood, log_likelihood_and_slope
 
 LENGTH_SHARES = (0.004, 0.02, 0.08)
 """Correlation lengths that are compared at first, as shares of the longest segment."""
@@ -16,27 +17,27 @@ LENGTH_SHARES = (0.004, 0.02, 0.08)
 LONGEST_SHARE = 0.1
 """The correlation length is at most this share of the record, so that lasting heat stays improbable."""
 
-ALL_NODES = -1
-"""Stands for the sizes on all nodes, moved by one factor."""
-
 SMALLEST_LOG_STEP, LARGEST_LOG_STEP = 0.1, 2.5
+"""Of the correlation length, and of any size, from pass to pass, in ln."""
+
+N_ITERATIONS = 8
+"""Of one pass: parameters move in between, so that no size need be final."""
+
+LEAST_SLOPE_NATS, LEAST_GAIN_NATS = 0.03, 0.01
+"""Per ln of a size, and per iteration: less is not followed. A size that no longer matters stays where it would matter again."""
 
 
 @dataclass
 class SizeSearch:
-    """A pattern search of the undeclared heat's size, whose steps shrink from pass to pass.
+    """A search of the undeclared heat's size: along the slope on every node, and in steps of the length that shrink.
 
     Attributes
     ----------
-    log_step : (n_nodes + 2,)
-        Next change to be tried, in ln: of the size on each node, of the correlation length, and of all sizes together.
+    log_step
+        Next change of the correlation length to be tried, in ln.
     """
 
-    log_step: FloatArray
-
-    def positions(self, nodes: Sequence[int] | None) -> tuple[int, ...]:
-        """Return what is tried: every node's size and the length, or with ``nodes`` the size of all and of these."""
-        return tuple(range(self.log_step.size - 1)) if nodes is None else (ALL_NODES, *nodes)
+    log_step: float
 
     def improve(
         self,
@@ -47,43 +48,66 @@ class SizeSearch:
     ) -> tuple[UndeclaredHeat, float]:
         """Return a more likely size of the undeclared heat, and its log-likelihood.
 
-        Sizes and correlation length are tried in turn; with ``nodes`` only the sizes on these, and of all together.
+        With ``nodes`` only the sizes on these, and of all together. Sizes follow by a quasi-Newton method (L-BFGS-B; Byrd, Lu,
+        Nocedal and Zhu 1995) on the exact slope of the likelihood.
         """
-        best, value = undeclared, log_likelihood(problem, undeclared, nominals)
-        for position in self.positions(nodes):
+        best, value = _along_the_slope(problem, undeclared, nominals, nodes)
+        if nodes is not None:
+            return best, value
+        moved = False
+        for sign in (-1.0, 1.0):
             check_time()
-            moved = False
-            for sign in (-1.0, 1.0):
-                trial = self._changed(best, position, sign, nominals)
-                found = log_likelihood(problem, trial, nominals)
-                if found > value:
-                    best, value, moved = trial, found, True
-                    break
-            self.log_step[position] *= 1.4 if moved else 0.5
-        self.log_step = np.clip(self.log_step, SMALLEST_LOG_STEP, LARGEST_LOG_STEP)
+            trial = _with_length(best, sign * self.log_step, nominals)
+            found = log_likelihood(problem, trial, nominals)
+            if found > value:
+                best, value, moved = trial, found, True
+                break
+        self.log_step = float(np.clip(self.log_step * (1.4 if moved else 0.5), SMALLEST_LOG_STEP, LARGEST_LOG_STEP))
         return best, value
 
-    def _changed(
-        self, undeclared: UndeclaredHeat, position: int, sign: float, nominals: Sequence[Nominal]
-    ) -> UndeclaredHeat:
-        factor = float(np.exp(sign * self.log_step[position]))
-        if position == undeclared.std_W.size:
-            shortest = float(np.median(nominals[0].segment.forcing.step_s))
-            length = np.clip(undeclared.length_s * factor, shortest, LONGEST_SHARE * span_s(nominals))
-            return replace(undeclared, length_s=float(length))
-        std = undeclared.std_W.copy()
-        std[slice(None) if position == ALL_NODES else position] *= factor
-        return replace(undeclared, std_W=std)
+
+def _along_the_slope(
+    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], nodes: Sequence[int] | None
+) -> tuple[UndeclaredHeat, float]:
+    """Return more likely sizes, of every node or of all together and of some, and their log-likelihood."""
+    n = undeclared.std_W.size
+    each = np.eye(n) if nodes is None else np.vstack([np.ones(n), np.eye(n)[list(nodes)]])
+    best = undeclared, -np.inf
+
+    def cost(moved: FloatArray) -> tuple[float, FloatArray]:
+        nonlocal best
+        check_time()
+        trial = replace(undeclared, std_W=undeclared.std_W * np.exp(moved @ each))
+        value, slope = log_likelihood_and_slope(problem, trial, nominals)
+        best = max(best, (trial, value), key=lambda tried: tried[1])
+        return (-value, -each @ slope) if np.isfinite(value) else (1e300, np.zeros(len(each)))
+
+    value, _ = cost(np.zeros(len(each)))
+    minimize(
+        cost,
+        np.zeros(len(each)),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(-LARGEST_LOG_STEP, LARGEST_LOG_STEP)] * len(each),
+        options={
+            "maxiter": N_ITERATIONS,
+            "gtol": LEAST_SLOPE_NATS,
+            "ftol": LEAST_GAIN_NATS / max(abs(value), 1.0),
+        },
+    )
+    return best
+
+
+def _with_length(undeclared: UndeclaredHeat, log_step: float, nominals: Sequence[Nominal]) -> UndeclaredHeat:
+    """Return undeclared heat of another correlation length, within what the record can tell."""
+    shortest = float(np.median(nominals[0].segment.forcing.step_s))
+    longest = LONGEST_SHARE * span_s(nominals)
+    return replace(undeclared, length_s=float(np.clip(undeclared.length_s * np.exp(log_step), shortest, longest)))
 
 
 def span_s(nominals: Sequence[Nominal]) -> float:
     """Return the length of the longest segment."""
     return max(float(n.segment.record.time_s[-1] - n.segment.record.time_s[0]) for n in nominals)
-
-
-def new_search(n_nodes: int, log_step: float) -> SizeSearch:
-    """Return a search whose first steps are ``log_step``; that of the length is gentler."""
-    return SizeSearch(np.append(np.full(n_nodes, log_step), [0.7, log_step]))
 
 
 def first_size(problem: Problem, nominals: Sequence[Nominal]) -> UndeclaredHeat:
