@@ -221,13 +221,18 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
 def try_on_trajectories(base: Trial, effects: Sequence[Effect], start: Calibration | None = None) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
-    Or from another ``start`` of the simpler problem. None where the balance has no solution there. The undeclared heat is
-    sized about the result, for a later look.
+    Or from another ``start`` of the simpler problem. Where the balance has no solution there, what is new starts smaller; None
+    where it has none even so. The undeclared heat is sized about the result, for a later look.
     """
     problem = extended(base.fit.problem, effects)
-    own = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(start or base.calibration(), problem, own))
-    if optimum.status == "no_solution":
+    there = {effect.place for effect in base.effects}
+    for share in (1.0, *SHORTER_SHARES):
+        some = [e if share == 1.0 or e.place in there else e.shortened(share) for e in effects]
+        own = {p.name: p.value for effect in some for p in effect.parameters()}
+        optimum = minimise(problem, carried_over(start or base.calibration(), problem, own))
+        if optimum.status != "no_solution":
+            break
+    else:
         return None
     fit = about_trajectory(problem, optimum)
     values = fit.network.parameters.as_dict()

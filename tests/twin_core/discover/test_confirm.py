@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.special import logsumexp
 from scipy.stats import chi2
 
@@ -56,6 +57,28 @@ def test_an_effect_that_starts_far_too_large_ends_no_less_likely_than_none(monke
     assert try_effects(base, [vast]).fit.log_posterior > base.fit.log_posterior - 3.0
     monkeypatch.setattr(confirm, "START_LOSS_NATS", np.inf)
     assert try_effects(base, [vast]).fit.log_posterior < base.fit.log_posterior - 30.0
+
+
+def test_an_effect_that_leaves_no_heat_balance_where_it_starts_starts_smaller() -> None:
+    """A load may be larger than what a node can lose: a start without a trajectory is no reason to refuse the effect."""
+    data = conductive_spec(1, [], boundaries={"space": {"value_K": 3.0}})
+    data["radiators"] = [{"node": "n0", "sink": "space", "area_m2": 0.1, "emissivity": 0.9}]
+    data["nodes"][0]["capacity_J_per_K"] = {"value": 4.0e3}
+    data["channels"]["T0"]["noise_std"] = NOISE_K
+    rng = np.random.default_rng(0)
+    constant = 0.09 * 5.670374419e-8  # W/K^4
+    time_s, level_W = np.linspace(0.0, 12000.0, 201), constant * 290.0**4
+    path = solve_ivp(
+        lambda t, y: (level_W - constant * y**4) / 4.0e3, (0.0, 12000.0), [330.0], t_eval=time_s, rtol=1e-8
+    )
+    fit, calibration = fit_network(
+        load_spec(data), [record_of(time_s, T0=path.y[0] + rng.normal(0.0, NOISE_K, time_s.size))]
+    )
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    chill = REGISTRY["constant_heat_load"]({"node": "n0"}, {"Q_W": -1e4})
+    trial = confirm.try_on_trajectories(base, (chill,))
+    assert trial is not None
+    assert trial.effects[0].values["Q_W"] == pytest.approx(level_W, rel=0.02)
 
 
 def test_an_effect_of_no_size_gains_nothing_over_a_fit_that_has_converged() -> None:
