@@ -145,7 +145,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
     told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
-    together = not (fallback or state.findings)  # what only pays off with another one is looked for once
+    together = widened and not fallback
     if together and not told:
         told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial

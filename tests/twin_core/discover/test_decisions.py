@@ -44,6 +44,7 @@ from twin_core.discover.policy import (
     REPEATABLE_SHARE,
     THRESHOLDS,
     VISIBLE_COARSENESS,
+    WIDENED,
 )
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
@@ -412,6 +413,32 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
     state = Search(base, base)
     assert searching._extend(state, NEEDED, fallback=False)
     assert [f.effects[0].where["node"] for f in state.findings] == [leads]
+
+
+@pytest.mark.parametrize(
+    ("known", "left", "asked"),
+    [([], 0.2, True), (["a"], WIDENED + JUST, True), (["a"], WIDENED, False)],
+    ids=["nothing is found yet", "more stays than the noise", "no more stays than the noise"],
+)
+def test_two_effects_are_tried_together_as_long_as_much_stays(
+    monkeypatch: pytest.MonkeyPatch, known: list[str], left: float, *, asked: bool
+) -> None:
+    pairs: list[Search] = []
+
+    def by_pairs(fork: Search, *arguments: object) -> bool:
+        pairs.append(fork)
+        return False
+
+    base = stub(*map(load, known), left=left)
+    base.fit = cast(Any, None)  # type: ignore[misc]
+    base.misfit_share = lambda: 0.0  # type: ignore[method-assign]
+    monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
+    monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, [[]]))
+    monkeypatch.setattr(searching, "_pairs_by_heat", by_pairs)
+    state = Search(base, base, findings=[Finding(judged(name, 50.0)) for name in known])
+    assert not searching._extend(state, NEEDED, fallback=False)
+    assert bool(pairs) == asked
+    assert not searching._extend(state, NEEDED, fallback=True) and len(pairs) == asked
 
 
 @pytest.mark.parametrize(
