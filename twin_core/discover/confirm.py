@@ -17,7 +17,7 @@ from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
 from twin_core.discover.left_out import blocked_errors, forward_error
 from twin_core.discover.once import ask_each, once
-from twin_core.effects.base import Effect, touched_nodes
+from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
 from twin_core.side_by_side import side_by_side
 
@@ -177,7 +177,7 @@ def fitted_effects(effects: Sequence[Effect], values: dict[str, float]) -> tuple
     return tuple(effect.at_parameters(values) for effect in effects)
 
 
-def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, quick: bool = False) -> Trial:
+def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) -> Trial:
     """Return the trial of a set of effects, fitted with all parameters from a trial close by.
 
     Parameters
@@ -188,8 +188,6 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
         All effects of the new trial, at their starting values.
     n_passes
         Passes of the fit at most: few to rank, many to settle.
-    quick
-        Whether the undeclared heat is sized anew only where the effects act.
     """
     problem = extended(base.fit.problem, effects)
     names = base.fit.problem.network.parameters.free_names
@@ -209,10 +207,7 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3, qu
             if loss_at_start(problem, shorter, base.fit) <= 0.0:
                 break
         starts.append(shorter)
-    layout = problem.network.layout
-    touched = sorted({layout.node(node) for effect in effects for node in touched_nodes(effect, layout)})
-    resized = touched if quick else None
-    fitted = partial(fit_with_undeclared_heat, problem, near=base.fit, n_passes=n_passes, resized=resized)
+    fitted = partial(fit_with_undeclared_heat, problem, near=base.fit, n_passes=n_passes)
     fits = side_by_side([partial(fitted, start) for start in starts])
     fit = max(fits, key=lambda f: f.log_posterior)
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)

@@ -104,9 +104,7 @@ def more_is_left_elsewhere(
 
 def _refitted(trial: Trial, effects: Sequence[Effect]) -> list[Trial]:
     """Return a trial with each of some effects on top, side by side."""
-    return side_by_side(
-        [partial(try_effects, trial, (*trial.effects, effect), n_passes=6, quick=True) for effect in effects]
-    )
+    return side_by_side([partial(try_effects, trial, (*trial.effects, effect), n_passes=6) for effect in effects])
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:

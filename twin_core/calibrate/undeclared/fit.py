@@ -126,7 +126,6 @@ def fit_with_undeclared_heat(
     near: HeatFit | None = None,
     n_passes: int = 12,
     early_prior_std: Sequence[float] = EARLY_PRIOR_STD,
-    resized: Sequence[int] | None = None,
     deadline: float = NO_DEADLINE,
 ) -> HeatFit:
     """Fit the free parameters in the presence of undeclared heat.
@@ -143,9 +142,6 @@ def fit_with_undeclared_heat(
         Passes at most, of a Gauss-Newton step and sizing; fewer where the likelihood no longer grows.
     early_prior_std
         Prior deviations of logarithmic parameters in the first passes, each about newly smoothed temperatures.
-    resized
-        Nodes on which the undeclared heat is sized anew, beside one factor for all; by default all, and its length. With
-        ``near`` only.
     deadline
         On the clock of ``time.monotonic``: no pass but the first is begun afterwards.
 
@@ -159,7 +155,7 @@ def fit_with_undeclared_heat(
     if near is not None:
         nominals, undeclared = _carried_over(problem, values, near)
         sizes = SizeSearch(FIRST_LOG_STEP)
-        return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, resized, deadline)
+        return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
@@ -177,7 +173,7 @@ def fit_with_undeclared_heat(
             fit = _pass(fit, sizes, most_std, smoothing=True)
         started.append((fit, sizes))
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
-    return _settle(fit, sizes, n_passes, deadline=deadline)
+    return _settle(fit, sizes, n_passes, deadline)
 
 
 def loss_at_start(problem: Problem, free: FloatArray, near: HeatFit) -> float:
@@ -191,7 +187,6 @@ def _settle(
     fit: HeatFit,
     sizes: SizeSearch,
     n_passes: int,
-    resized: Sequence[int] | None = None,
     deadline: float = NO_DEADLINE,
 ) -> HeatFit:
     """Take passes until the likelihood no longer grows."""
@@ -200,10 +195,9 @@ def _settle(
         before, free = fit.log_likelihood, fit.free
         if is_late(deadline) and np.isfinite(before):
             break
-        fit = _pass(fit, sizes, np.inf, resized=resized, still=refused >= MOST_REFUSED)
+        fit = _pass(fit, sizes, np.inf, still=refused >= MOST_REFUSED)
         refused = refused + 1 if np.array_equal(free, fit.free) else 0
-        small = resized is not None or sizes.log_step < SETTLED_LOG_STEP
-        if fit.log_likelihood - before < SETTLED_NATS and small:
+        if fit.log_likelihood - before < SETTLED_NATS and sizes.log_step < SETTLED_LOG_STEP:
             break
     return fit
 
@@ -214,7 +208,6 @@ def _pass(
     most_std: float,
     *,
     smoothing: bool = False,
-    resized: Sequence[int] | None = None,
     still: bool = False,
 ) -> HeatFit:
     """Relinearise about smoothed temperatures where asked, improve parameters but for ``still``, then the heat's size."""
@@ -225,7 +218,7 @@ def _pass(
     free, undeclared = fit.free, fit.undeclared
     if not still:
         free, undeclared, nominals = _improve(problem, free, undeclared, nominals, most_std)
-    undeclared, value = sizes.improve(problem, undeclared, nominals, resized)
+    undeclared, value = sizes.improve(problem, undeclared, nominals)
     return HeatFit(problem, free, undeclared, nominals, value)
 
 

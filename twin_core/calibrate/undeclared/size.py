@@ -40,20 +40,13 @@ class SizeSearch:
     log_step: float
 
     def improve(
-        self,
-        problem: Problem,
-        undeclared: UndeclaredHeat,
-        nominals: Sequence[Nominal],
-        nodes: Sequence[int] | None = None,
+        self, problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
     ) -> tuple[UndeclaredHeat, float]:
         """Return a more likely size of the undeclared heat, and its log-likelihood.
 
-        With ``nodes`` only the sizes on these, and of all together. Sizes follow by a quasi-Newton method (L-BFGS-B; Byrd, Lu,
-        Nocedal and Zhu 1995) on the exact slope of the likelihood.
+        Sizes follow by a quasi-Newton method (L-BFGS-B; Byrd, Lu, Nocedal and Zhu 1995) on the exact slope of the likelihood.
         """
-        best, value = _along_the_slope(problem, undeclared, nominals, nodes)
-        if nodes is not None:
-            return best, value
+        best, value = _along_the_slope(problem, undeclared, nominals)
         moved = False
         for sign in (-1.0, 1.0):
             check_time()
@@ -67,28 +60,27 @@ class SizeSearch:
 
 
 def _along_the_slope(
-    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], nodes: Sequence[int] | None
+    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
 ) -> tuple[UndeclaredHeat, float]:
-    """Return more likely sizes, of every node or of all together and of some, and their log-likelihood."""
-    n = undeclared.std_W.size
-    each = np.eye(n) if nodes is None else np.vstack([np.ones(n), np.eye(n)[list(nodes)]])
+    """Return more likely sizes, and their log-likelihood."""
+    still = np.zeros(undeclared.std_W.size)
     best = undeclared, -np.inf
 
     def cost(moved: FloatArray) -> tuple[float, FloatArray]:
         nonlocal best
         check_time()
-        trial = replace(undeclared, std_W=undeclared.std_W * np.exp(moved @ each))
+        trial = replace(undeclared, std_W=undeclared.std_W * np.exp(moved))
         value, slope = log_likelihood_and_slope(problem, trial, nominals)
         best = max(best, (trial, value), key=lambda tried: tried[1])
-        return (-value, -each @ slope) if np.isfinite(value) else (1e300, np.zeros(len(each)))
+        return (-value, -slope) if np.isfinite(value) else (1e300, still)
 
-    value, _ = cost(np.zeros(len(each)))
+    value, _ = cost(still)
     minimize(
         cost,
-        np.zeros(len(each)),
+        still,
         jac=True,
         method="L-BFGS-B",
-        bounds=[(-LARGEST_LOG_STEP, LARGEST_LOG_STEP)] * len(each),
+        bounds=[(-LARGEST_LOG_STEP, LARGEST_LOG_STEP)] * still.size,
         options={
             "maxiter": N_ITERATIONS,
             "gtol": LEAST_SLOPE_NATS,
