@@ -145,8 +145,9 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
     told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
-    together = widened and not fallback
-    if together and not told:
+    if not (
+        told or fallback or state.findings
+    ):  # later on, pairs are left to the trajectories: many fits, and none held
         told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial
     if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
@@ -167,7 +168,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     misfit = leaves(state.trial)
     seen, sets = look(by_trajectory, [state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
     least = min(misfit, leaves(by_trajectory.trial)) if seen else misfit
-    if together and sets and least >= TOGETHER_MISFIT_SHARE:
+    if not fallback and sets and least >= TOGETHER_MISFIT_SHARE:
         beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
         paired, _ = look(by_pairs, [*sets, *beside], 2)
     options = [fork for fork, found in ((by_heat, told), (by_trajectory, seen), (by_pairs, paired)) if found]

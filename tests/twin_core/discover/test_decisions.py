@@ -416,29 +416,38 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
 
 
 @pytest.mark.parametrize(
-    ("known", "left", "asked"),
-    [([], 0.2, True), (["a"], WIDENED + JUST, True), (["a"], WIDENED, False)],
+    ("known", "left", "by_heat", "by_trajectory"),
+    [([], 0.2, True, True), (["a"], WIDENED + JUST, False, True), (["a"], WIDENED, False, False)],
     ids=["nothing is found yet", "more stays than the noise", "no more stays than the noise"],
 )
 def test_two_effects_are_tried_together_as_long_as_much_stays(
-    monkeypatch: pytest.MonkeyPatch, known: list[str], left: float, *, asked: bool
+    monkeypatch: pytest.MonkeyPatch, known: list[str], left: float, *, by_heat: bool, by_trajectory: bool
 ) -> None:
-    pairs: list[Search] = []
+    asked: list[int | str] = []
 
-    def by_pairs(fork: Search, *arguments: object) -> bool:
-        pairs.append(fork)
+    def pairs_by_heat(*arguments: object) -> bool:
+        asked.append("heat")
         return False
+
+    def look(
+        fork: Search, needed: float, seeds: list[Trial], near: object, n: int, *, fallback: bool, known: object
+    ) -> tuple[bool, list[Trial]]:
+        asked.append(n)
+        return False, [fork.trial]
 
     base = stub(*map(load, known), left=left)
     base.fit = cast(Any, None)  # type: ignore[misc]
-    base.misfit_share = lambda: 0.0  # type: ignore[method-assign]
+    base.misfit_share = lambda: 20.0  # type: ignore[method-assign]
     monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
     monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, [[]]))
-    monkeypatch.setattr(searching, "_pairs_by_heat", by_pairs)
+    monkeypatch.setattr(searching, "_pairs_by_heat", pairs_by_heat)
+    monkeypatch.setattr(searching, "extend_by_trajectory", look)
     state = Search(base, base, findings=[Finding(judged(name, 50.0)) for name in known])
     assert not searching._extend(state, NEEDED, fallback=False)
-    assert bool(pairs) == asked
-    assert not searching._extend(state, NEEDED, fallback=True) and len(pairs) == asked
+    assert asked == ["heat"] * by_heat + [1, 2] * by_trajectory
+    asked.clear()
+    assert not searching._extend(state, NEEDED, fallback=True)
+    assert asked == [1] * by_trajectory
 
 
 @pytest.mark.parametrize(
