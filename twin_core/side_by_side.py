@@ -142,7 +142,11 @@ def _work(
                 told = True, works[i]()
             except Exception as error:
                 told = False, error
-            sender.send_bytes(_dumped((i, told), known))
+            try:
+                content = _dumped((i, told), known)
+            except (pickle.PicklingError, AttributeError, TypeError):
+                continue  # the parent makes it again
+            sender.send_bytes(content)
         status = 0
     finally:
         os._exit(status)  # nothing that the parent has set up for its own end is ours to do

@@ -142,6 +142,12 @@ def test_a_result_that_cannot_be_sent_is_made_again() -> None:
     assert (first(), second()) == (1, 2)
 
 
+def test_a_process_goes_on_after_a_result_that_it_cannot_send() -> None:
+    made = side_by_side([*[partial(lambda i: lambda: i, i) for i in range(2)], *[os.getpid] * 6])
+    assert [make() for make in made[:2]] == [0, 1]
+    assert os.getpid() not in made[2:]
+
+
 def test_no_process_or_descriptor_is_left_behind() -> None:
     children = Path(f"/proc/self/task/{os.getpid()}/children")
     before = os.listdir("/proc/self/fd"), children.read_text()

@@ -1,6 +1,7 @@
 """Whether an effect keeps the conventions, and whether its derivatives are right: what a plug-in must pass to be used."""
 
 import json
+import pickle
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -254,6 +255,20 @@ def _json(kind: type[Effect]) -> str:
     return "there and back is exact"
 
 
+def _processes(kind: type[Effect]) -> str:
+    effect = active_effect(kind)
+    try:
+        again, addition = pickle.loads(pickle.dumps((effect, effect.addition(every_term_network([effect]).layout))))
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise _Wrong(
+            f"{error}: candidates are fitted in processes of their own, so let terms hold methods or "
+            "functions of the module instead of local ones"
+        ) from error
+    if again != effect or len(addition.terms) != len(effect.addition(every_term_network([effect]).layout).terms):
+        raise _Wrong("sent to another process, it is another")
+    return "can be sent from one to another"
+
+
 CHECKS: dict[str, Callable[[type[Effect]], str]] = {
     "name and sentence": _names,
     "places": _places,
@@ -266,6 +281,7 @@ CHECKS: dict[str, Callable[[type[Effect]], str]] = {
     "energy": _energy,
     "sign": _sign,
     "model file": _json,
+    "processes": _processes,
 }
 
 

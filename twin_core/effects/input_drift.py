@@ -26,14 +26,15 @@ class InputDrift(Effect):
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""
-        begin = self.settings["t0_s"]
+        return correct_channel(self, layout, self._beyond, dated=self.settings["dated"])
 
-        def shape(declared: FloatArray, clock_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-            change = values[0] * (clock_s - begin)
-            slope = np.where(change > -1.0, clock_s - begin, 0.0)
-            return np.maximum(change, -1.0) * declared, [slope * declared]
-
-        return correct_channel(self, layout, shape, dated=self.settings["dated"])
+    def _beyond(
+        self, declared: FloatArray, clock_s: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        elapsed_s = clock_s - self.settings["t0_s"]
+        change = values[0] * elapsed_s
+        slope = np.where(change > -1.0, elapsed_s, 0.0)
+        return np.maximum(change, -1.0) * declared, [slope * declared]
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:

@@ -41,17 +41,18 @@ class InputPowerLaw(Effect):
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""
+        return correct_channel(self, layout, self._beyond)
+
+    def _beyond(
+        self, declared: FloatArray, time_s: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, list[FloatArray]]:
         held = self.settings.get("reference")
-
-        def shape(declared: FloatArray, time_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-            exponent, reference = values[0], float(held) if held is not None else values[1]
-            ratio = np.maximum(declared, 0.0) / reference
-            logarithm = np.log(np.maximum(ratio, 1e-12))
-            delivered = np.where(ratio > 0.0, declared * np.exp((exponent - 1.0) * logarithm), 0.0)
-            slopes = [delivered * logarithm, -(exponent - 1.0) / reference * delivered]
-            return delivered - np.maximum(declared, 0.0), slopes[: values.size]
-
-        return correct_channel(self, layout, shape)
+        exponent, reference = values[0], float(held) if held is not None else values[1]
+        ratio = np.maximum(declared, 0.0) / reference
+        logarithm = np.log(np.maximum(ratio, 1e-12))
+        delivered = np.where(ratio > 0.0, declared * np.exp((exponent - 1.0) * logarithm), 0.0)
+        slopes = [delivered * logarithm, -(exponent - 1.0) / reference * delivered]
+        return delivered - np.maximum(declared, 0.0), slopes[: values.size]
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:

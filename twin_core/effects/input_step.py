@@ -25,12 +25,13 @@ class InputStep(OnsetEffect):
 
     def addition(self, layout: Layout) -> Addition:
         """Return the corrections of the channel's loads."""
+        return correct_channel(self, layout, self._beyond, dated=self.settings["dated"])
 
-        def shape(declared: FloatArray, clock_s: FloatArray, values: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
-            change, slopes = self.change(clock_s, values)
-            return change * declared, [slope * declared for slope in slopes]
-
-        return correct_channel(self, layout, shape, dated=self.settings["dated"])
+    def _beyond(
+        self, declared: FloatArray, clock_s: FloatArray, values: FloatArray
+    ) -> tuple[FloatArray, list[FloatArray]]:
+        change, slopes = self.change(clock_s, values)
+        return change * declared, [slope * declared for slope in slopes]
 
     def centred(self, survey: Survey) -> Self:
         """Return the onset in the middle of the time in which the input is off, if it lies in or next to such a time."""

@@ -45,6 +45,9 @@ TWICE = """    def _nothing(cls) -> None: ...
 
     @classmethod
 """
+LOCAL = [
+    ("        return Addition((LouverHeat(", "        class Local(LouverHeat): ...\n\n        return Addition((Local(")
+]
 
 
 @pytest.mark.parametrize(
@@ -90,6 +93,7 @@ TWICE = """    def _nothing(cls) -> None: ...
         (LOUVER, [WARMING, *ITS_SLOPES], "sign", "heat flows into a while space is colder"),
         (CONDUCTOR, [("[heat, -heat]", "[heat, -0.9 * heat]")], "energy", "must add up to zero"),
         (LOUVER, [('"T_range_K": range_K}', '"T_range_K": range_K}, {"box": {"a": (1.0,)}}')], "model file", "another"),
+        (LOUVER, LOCAL, "processes", "in processes of their own"),
     ],
 )
 def test_each_mistake_is_told(
