@@ -34,6 +34,9 @@ SETTLING_NATS = 40.0
 """Options this many nats of log evidence behind after a few passes are not fitted further: a limit of time, not of belief. A pair
 that is found 201 nats likelier began 11 behind: missed at 0, found at 20, 40 and 80 in about the same time."""
 
+Extension = tuple[Trial, Effect, int]
+"""A trial, an effect to be fitted on top of it, and how many sets of effects were looked at to find it."""
+
 N_KEPT, N_SETTLED = 4, 2
 """Sets of effects that are extended by one more, and that are fitted in the presence of undeclared heat too."""
 
@@ -72,10 +75,14 @@ def extend_by_trajectory(
     bool, list of Trial
         The best trials are the seeds of a next look, at one effect more together.
     """
-    judged = [j for seed in seeds for j in _extended(state, seed, n_together, needed, fallback=fallback)]
+    own = _extensions(state, seeds, n_together, needed, fallback=fallback)
     # What the filter suggests beside little heat is no seed: it is far from where long trajectories point.
-    close = _extended_near(state, near, needed, fallback=fallback) if n_together == 1 else []
-    sets, best = once_each(judged)[:N_KEPT], once_each([*judged, *close])[:N_KEPT]
+    close = _near_extensions(state, near, needed, fallback=fallback) if n_together == 1 else []
+    works = [
+        (partial(_fitted, state, *extension), f"{extension[1].label} on trajectories") for extension in own + close
+    ]
+    fitted = state.attempt_each(works)
+    sets, best = (once_each([j for j in some if j is not None])[:N_KEPT] for some in (fitted[: len(own)], fitted))
     if not best:
         return False, []
     options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
@@ -84,30 +91,36 @@ def extend_by_trajectory(
     return accept(state, options, needed), [j.trial for j in sets]
 
 
-def _extended(state: Search, seed: Trial, n_together: int, needed: float, *, fallback: bool) -> list[Judged]:
-    """Return what one more effect makes of a trial, judged against the state's model."""
-    calibration = seed.calibration()
-    fit = about_trajectory(calibration.problem, calibration.optimum)
-    screenings = screened(seed, fit, UNDECLARED_SHARES, fallback=fallback)
-    rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
-    n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
-    effects = refined(fit, shortlist(rankings, needed, N_REFITS))
-    return _all_fitted(state, seed, effects, comb(n_tried, n_together))
+def _extensions(
+    state: Search, seeds: Sequence[Trial], n_together: int, needed: float, *, fallback: bool
+) -> list[Extension]:
+    """Return the effects that trajectories of some trials suggest on top of them."""
+
+    def suggested(seed: Trial) -> tuple[list[Effect], int]:
+        calibration = seed.calibration()
+        fit = about_trajectory(calibration.problem, calibration.optimum)
+        screenings = screened(seed, fit, UNDECLARED_SHARES, fallback=fallback)
+        rankings = [best_of_each_place(screening.probes, seed.n_samples) for screening in screenings]
+        return refined(fit, shortlist(rankings, needed, N_REFITS)), max(len(ranked) for ranked in rankings)
+
+    found: list[Extension] = []
+    works = [(partial(suggested, seed), "what trajectories suggest") for seed in seeds]
+    for seed, told in zip(seeds, state.attempt_each(works), strict=True):
+        if told is not None:
+            effects, n_looked_at = told
+            n_tried = comb(state.count(n_looked_at, fallback=fallback), n_together)
+            found += [(seed, effect, n_tried) for effect in effects]
+    return found
 
 
-def _extended_near(state: Search, near: Sequence[Probe], needed: float, *, fallback: bool) -> list[Judged]:
-    """Return what effects make of the state's model that are screened about the measured temperatures, beside little heat.
+def _near_extensions(state: Search, near: Sequence[Probe], needed: float, *, fallback: bool) -> list[Extension]:
+    """Return effects for the state's model that are screened about the measured temperatures, beside little heat.
 
     Where a model misses much, its own trajectories lie far from the measured ones, and what answers there is another effect.
     """
     effects = refined(state.trial.fit, shortlist([near], needed, N_NEAR))
-    return _all_fitted(state, state.trial, effects, state.count(max(len(near), 1), fallback=fallback))
-
-
-def _all_fitted(state: Search, seed: Trial, effects: Sequence[Effect], n_tried: int) -> list[Judged]:
-    """Return a trial with each of some effects on top, fitted on trajectories and judged against the state's model."""
-    works = [(partial(_fitted, state, seed, effect, n_tried), f"{effect.label} on trajectories") for effect in effects]
-    return [j for j in state.attempt_each(works) if j is not None]
+    n_tried = state.count(max(len(near), 1), fallback=fallback)
+    return [(state.trial, effect, n_tried) for effect in effects]
 
 
 def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged | None:

@@ -373,12 +373,15 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
         asked.append(list(options))
         return True
 
-    monkeypatch.setattr(trajectories, "_extended", lambda *arguments, fallback: [by_trajectory])
-    monkeypatch.setattr(trajectories, "_extended_near", lambda *arguments, fallback: [by_filter])
+    base = stub()
+    monkeypatch.setattr(trajectories, "_extensions", lambda *arguments, fallback: [(base, load("a"), 5)])
+    monkeypatch.setattr(trajectories, "_near_extensions", lambda *arguments, fallback: [(base, load("b"), 5)])
+    fitted = {"a": by_trajectory, "b": by_filter}
+    monkeypatch.setattr(trajectories, "_fitted", lambda state, seed, effect, n_tried: fitted[effect.where["node"]])
     monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
     monkeypatch.setattr(trajectories, "accept", accepted)
-    state = Search(stub(), stub(), n_named=5)
-    told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [stub()], [], n_together, fallback=False)
+    state = Search(base, base, n_named=5)
+    told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [base], [], n_together, fallback=False)
     assert told and seeds == [by_trajectory.trial]
     assert asked == [[by_filter, by_trajectory] if n_together == 1 else [by_trajectory]]
 
