@@ -269,6 +269,10 @@ def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[
     fresh = []
     for nominal, segment in zip(near.nominals, problem.segments, strict=True):
         states = states_of(nominal)[:, source]
-        fresh.append(linearise(problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0)))
+        fresh.append(
+            linearise(
+                problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0), grid=nominal.grid
+            )
+        )
     std = np.where(own, near.undeclared.std_W[source], 1e-6)
     return tuple(fresh), UndeclaredHeat(std, near.undeclared.length_s)
