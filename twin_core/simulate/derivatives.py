@@ -4,8 +4,8 @@ import numpy as np
 from numba import njit
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.simulate.matrices import factorise, multiply, multiply_columns, solve_columns
-from twin_core.simulate.modes import Modes, dense, divided_differences, weights
+from twin_core.simulate.matrices import factorise, multiply, product, solve_columns
+from twin_core.simulate.modes import Modes, Turning, dense, divided_differences, weights
 from twin_core.simulate.relays import Relays, is_recalled
 
 
@@ -57,6 +57,36 @@ def _shares(
 
 
 @njit(cache=True, nogil=True)
+def _add_turned(
+    turns: Turning,
+    modes: Modes,
+    into: FloatArray,
+    outof: FloatArray,
+    mixed: FloatArray,
+    through: FloatArray,
+    pushed: FloatArray,
+    columns: FloatArray,
+) -> None:
+    """Add outward ((inward dA outward) * mixed^T) 1 of every column that changes A to its column of ``columns``, (n, n_columns).
+
+    ``mixed`` [j, i] is how the end of a step answers in mode i to a change of A from mode j to i; ``into`` and ``outof`` are
+    inward and outward transposed, ``through`` (n, n) and ``pushed`` (2, n_turned, n) are for its use. The dA are taken entry by
+    entry, for a coupling has four of them.
+    """
+    n = into.shape[0]
+    product(modes.outward, mixed, through)
+    pushed[0] = 0.0
+    for e in range(turns.which.size):
+        t, row, column, value = turns.which[e], turns.row[e], turns.column[e], turns.value[e]
+        for i in range(n):
+            pushed[0, t, i] += value * into[row, i] * through[column, i]
+    product(pushed[0], outof, pushed[1])
+    for i in range(n):
+        for t in range(turns.columns.size):
+            columns[i, turns.columns[t]] += pushed[1, t, i]
+
+
+@njit(cache=True, nogil=True)
 def _unswitched(
     modes: Modes,
     relays: Relays,
@@ -67,8 +97,7 @@ def _unswitched(
     relay_column: IntArray,
     relay_slope: FloatArray,
     divided: FloatArray,
-    turned: IntArray,
-    turning: FloatArray,
+    turns: Turning,
     lu: FloatArray,
     pivots: IntArray,
     n_columns: int,
@@ -76,21 +105,20 @@ def _unswitched(
     """Return what the end of a relay's node would answer more to the columns if the relay had not switched, (n_columns,)."""
     n, node = early.shape[0], relays.node[r]
     more = (kick[12] - kick[0], kick[13] - kick[1])
-    columns, pushed = np.zeros((n, n_columns)), np.empty(n)
+    columns, mixed = np.zeros((n, n_columns)), np.empty((n, n))
     for which in range(2, 4):
         if relay_column[which, r] >= 0:
             for i in range(n):
                 by_rate = more[0] * early[i, node] + more[1] * late[i, node]
                 columns[i, relay_column[which, r]] += relay_slope[which, r] * by_rate
-    for t in range(turned.size):
-        for i in range(n):
-            pushed[i] = 0.0
-            for j in range(n):
-                by_rate = more[0] * divided[1, i, j] + more[1] * divided[2, i, j]
-                pushed[i] += turning[t, i, j] * by_rate * relays.rate[r] * modes.inward[j, node]
-        for i in range(n):
-            for j in range(n):
-                columns[i, turned[t]] += modes.outward[i, j] * pushed[j]
+    if turns.columns.size > 0:
+        for j in range(n):
+            for i in range(n):
+                by_rate = more[0] * divided[1, j, i] + more[1] * divided[2, j, i]
+                mixed[j, i] = by_rate * relays.rate[r] * modes.inward[j, node]
+        into, outof = modes.inward.T.copy(), modes.outward.T.copy()
+        through, pushed = np.empty((n, n)), np.empty((2, turns.columns.size, n))
+        _add_turned(turns, modes, into, outof, mixed, through, pushed, columns)
     solve_columns(lu, pivots, columns)
     return columns[node].copy()
 
@@ -108,8 +136,7 @@ def march_sensitivities(
     kicks: FloatArray,
     relay_column: IntArray,
     relay_slope: FloatArray,
-    turned: IntArray,
-    turning: FloatArray,
+    turns: Turning,
     entry_column: IntArray,
     entry_node: IntArray,
     entry_series: FloatArray,
@@ -134,10 +161,8 @@ def march_sensitivities(
     relay_column, relay_slope : (4, n_relays)
         Which columns the low and the high threshold and the rate depend on, the last by its power and by the capacity (-1 for
         none), and how.
-    turned : (n_turned,)
-        Columns that change A.
-    turning : (n_turned, n, n)
-        By how much, inward dA outward.
+    turns
+        Which columns change A, and by how much: dA, not C dA.
     entry_column, entry_node : (n_series,)
     entry_series : (n_series, n_steps, 2)
         d f / d column at the same states.
@@ -158,7 +183,9 @@ def march_sensitivities(
     dense_keep, dense_early, dense_late = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
     divided, mixed = np.empty((3, n, n)), np.empty((n, n))
     matrix, pivots = np.empty((n, n)), np.empty(n, dtype=np.int64)
-    work, pushed = np.empty((n, n_columns)), np.empty(n)
+    into, outof = modes.inward.T.copy(), modes.outward.T.copy()
+    through, pushed = np.empty((n, n)), np.empty((2, turns.columns.size, n))
+    work = np.empty((n, n_columns))
     vector, responses = np.empty((n, 2)), np.empty((2, n_columns))
     mode, g = np.empty((2, n)), np.empty((2, n))
     state = start.copy()
@@ -175,42 +202,32 @@ def march_sensitivities(
             dense(modes.outward, keep, modes.inward, dense_keep)
             dense(modes.outward, early, modes.inward, dense_early)
             dense(modes.outward, late, modes.inward, dense_late)
-            if turned.size > 0:
+            if turns.columns.size > 0:
                 divided_differences(at_s, modes.rate_per_s, keep, early, late, divided)
         matrix[:] = dense_keep
         _add_product(dense_early, row, column, entry[k, 0], matrix)
-        multiply_columns(matrix, state, work)
+        product(matrix, state, work)
         for e in range(entry_column.size):
             node, first, last = entry_node[e], entry_series[e, k, 0], entry_series[e, k, 1]
             if first != 0.0 or last != 0.0:
                 for i in range(n):
                     work[i, entry_column[e]] += dense_early[i, node] * first + dense_late[i, node] * last
-        if turned.size > 0:
+        if turns.columns.size > 0:
             for side in range(2):
                 multiply(modes.inward, stages[k, side], mode[side])
                 multiply(modes.inward, rate[k, side], g[side])
                 for i in range(n):
                     g[side, i] -= modes.rate_per_s[i] * mode[side, i]
-            for i in range(n):
-                for j in range(n):
-                    mixed[i, j] = (
-                        divided[0, i, j] * mode[0, j]
-                        + divided[1, i, j] * g[0, j]
-                        + divided[2, i, j] * g[1, j]
+            for j in range(n):
+                for i in range(n):
+                    mixed[j, i] = (
+                        divided[0, j, i] * mode[0, j]
+                        + divided[1, j, i] * g[0, j]
+                        + divided[2, j, i] * g[1, j]
                         - early[i] * mode[0, j]
                         - late[i] * mode[1, j]
                     )
-            for t in range(turned.size):
-                for i in range(n):
-                    total = 0.0
-                    for j in range(n):
-                        total += turning[t, i, j] * mixed[i, j]
-                    pushed[i] = total
-                for i in range(n):
-                    total = 0.0
-                    for j in range(n):
-                        total += modes.outward[i, j] * pushed[j]
-                    work[i, turned[t]] += total
+            _add_turned(turns, modes, into, outof, mixed, through, pushed, work)
         matrix[:] = 0.0
         _add_product(dense_late, row, column, entry[k, 1], matrix)
         for i in range(n):
@@ -233,8 +250,7 @@ def march_sensitivities(
                     relay_column,
                     relay_slope,
                     divided,
-                    turned,
-                    turning,
+                    turns,
                     matrix,
                     pivots,
                     n_columns,

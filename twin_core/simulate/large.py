@@ -12,8 +12,7 @@ from numba import njit
 from scipy.linalg import qr
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.simulate.modes import Modes, divided_differences, weights
-from twin_core.simulate.splitting import Turning
+from twin_core.simulate.modes import Modes, Turning, divided_differences, weights
 
 MANY = 48
 """Nodes from which on this way is the quicker one."""
@@ -100,7 +99,7 @@ class _Turned:
             out[turns.columns] += (self._dense @ mixed[:, :, None])[:, :, 0].T
         else:
             through = self._outward @ mixed.T
-            _turn(self._columns, turns.row, turns.column, turns.value_W_per_K, inward, through, out)
+            _turn(self._columns, turns.row, turns.column, turns.value, inward, through, out)
 
 
 class _Beside:
@@ -156,8 +155,7 @@ def march_sensitivities_of_many(
 ) -> tuple[FloatArray, FloatArray]:
     """Advance d state / d column along a trajectory without relays.
 
-    Arguments and result as of ``march_sensitivities``, but ``turns`` is dA between nodes: a coupling changes four of its entries,
-    which are taken one by one where they are few.
+    Arguments and result as of ``march_sensitivities``; the entries of ``turns`` are taken one by one where they are few.
     """
     n_steps, (n, n_columns) = step_s.size, start.shape
     out = np.empty((sample_step.size, observed.size, n_columns))

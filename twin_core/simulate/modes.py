@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from twin_core._typing import FloatArray
+from twin_core._typing import FloatArray, IntArray
 from twin_core.simulate.matrices import multiply_columns
 
 
@@ -22,6 +22,40 @@ class Modes(NamedTuple):
     rate_per_s: FloatArray
     outward: FloatArray
     inward: FloatArray
+
+
+class Turning(NamedTuple):
+    """How free parameters change A, or C A.
+
+    Attributes
+    ----------
+    columns : (n_turned,)
+        Positions of these parameters among the free ones.
+    which, row, column : (n_entries,)
+        Position in ``columns``, and place in the matrix; entries at one place add up.
+    value : (n_entries,)
+        dA / d free parameter, or C dA (W/K per unit of it).
+    """
+
+    columns: IntArray
+    which: IntArray
+    row: IntArray
+    column: IntArray
+    value: FloatArray
+
+    def dense(self, n_nodes: int) -> FloatArray:
+        """Return the matrices, (n_turned, n_nodes, n_nodes)."""
+        out = np.zeros((self.columns.size, n_nodes, n_nodes))
+        np.add.at(out, (self.which, self.row, self.column), self.value)
+        return out
+
+    def per(self, capacity_J_per_K: FloatArray) -> "Turning":
+        """Return dA / d free parameter from C dA, the capacities being (n_nodes,)."""
+        return self._replace(value=self.value / capacity_J_per_K[self.row])
+
+
+_NOTHING = np.zeros(0, dtype=np.int64)
+NO_TURNING = Turning(_NOTHING, _NOTHING, _NOTHING, _NOTHING, np.zeros(0))
 
 
 @njit(cache=True, nogil=True)

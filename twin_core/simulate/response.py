@@ -17,14 +17,12 @@ from twin_core.network.storage import store, to_enthalpy_K
 from twin_core.simulate.derivatives import march_sensitivities
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.large import MANY, march_sensitivities_of_many
-from twin_core.simulate.modes import Modes
+from twin_core.simulate.modes import NO_TURNING, Modes, Turning
 from twin_core.simulate.one_step import take_steps
 from twin_core.simulate.relays import N_KICK, NO_RELAYS, Relays
 from twin_core.simulate.rollout import Rollout
 from twin_core.simulate.splitting import (
-    NO_TURNING,
     Split,
-    Turning,
     anchors,
     less_modes,
     modes_of,
@@ -267,8 +265,7 @@ def _march(
     if state.shape[0] >= MANY and split.relays.node.size == 0:
         block, end = march_sensitivities_of_many(*along, split.turns, *rest)
     else:
-        in_modes = split.modes.inward @ split.turns.dense(state.shape[0]) @ split.modes.outward
-        block, end = march_sensitivities(*along, *switched, split.turns.columns, in_modes, *rest)
+        block, end = march_sensitivities(*along, *switched, split.turns, *rest)
     if balance.moves:
         slope = np.concatenate([begin_slope, balance.slope[1::2]])
         block *= slope[sample_step][:, observed, None]

@@ -21,7 +21,7 @@ from twin_core.network.surroundings import surround
 from twin_core.network.terms import Along, ChannelLoad, Conductors, NodeRadiation, Relay, TableLoad
 from twin_core.simulate.forcing import Forcing
 from twin_core.simulate.kernels import Remainder
-from twin_core.simulate.modes import Modes
+from twin_core.simulate.modes import NO_TURNING, Modes, Turning
 from twin_core.simulate.relays import NO_RELAYS, Relays
 
 STRETCH, LONGEST_STRETCH, STRETCH_STATES = 1024, 8192, 65_536
@@ -360,40 +360,6 @@ def limits(network: Network, values: FloatArray, limit_K: tuple[float, float]) -
     lowest, highest = (to_enthalpy_K(network, values, np.full(len(network.nodes), limit)) for limit in limit_K)
     return lowest, highest
 
-
-@dataclass(frozen=True)
-class Turning:
-    """How free parameters change C A.
-
-    Attributes
-    ----------
-    columns : (n_turned,)
-        Positions of these parameters among the free ones.
-    which, row, column : (n_entries,)
-        Position in ``columns``, and place in the matrix; entries at one place add up.
-    value_W_per_K : (n_entries,)
-        C dA / d free parameter.
-    """
-
-    columns: IntArray
-    which: IntArray
-    row: IntArray
-    column: IntArray
-    value_W_per_K: FloatArray
-
-    def dense(self, n_nodes: int) -> FloatArray:
-        """Return the matrices, (n_turned, n_nodes, n_nodes)."""
-        out = np.zeros((self.columns.size, n_nodes, n_nodes))
-        np.add.at(out, (self.which, self.row, self.column), self.value_W_per_K)
-        return out
-
-    def per(self, capacity_J_per_K: FloatArray) -> "Turning":
-        """Return dA / d free parameter instead, the capacities being (n_nodes,)."""
-        return replace(self, value_W_per_K=self.value_W_per_K / capacity_J_per_K[self.row])
-
-
-_NOTHING = np.zeros(0, dtype=np.int64)
-NO_TURNING = Turning(_NOTHING, _NOTHING, _NOTHING, _NOTHING, np.zeros(0))
 
 _Entries = tuple[IntArray, IntArray, IntArray, FloatArray]
 """Parameter, row, column and value of entries, (n_entries,) each."""

@@ -6,7 +6,7 @@ from scipy.linalg import expm
 
 from twin_core.simulate.derivatives import march_sensitivities, transitions
 from twin_core.simulate.kernels import NOT_NEAR, Remainder, march
-from twin_core.simulate.modes import Modes, phi
+from twin_core.simulate.modes import Modes, Turning, phi
 from twin_core.simulate.relays import N_KICK, NO_RELAYS
 from twin_core.simulate.splitting import entries, modes_of
 
@@ -182,8 +182,7 @@ def test_sensitivities_are_the_derivative_of_the_scheme_that_of_a_included() -> 
         NO_KICKS,
         np.zeros((4, 0), dtype=np.int64),
         np.zeros((4, 0)),
-        np.array([0, 1]),
-        modes.inward @ turns @ modes.outward,
+        Turning(np.array([0, 1]), *np.nonzero(turns), turns[np.nonzero(turns)]),
         series_column,
         series_node,
         series,
