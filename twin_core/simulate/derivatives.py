@@ -57,6 +57,44 @@ def _shares(
 
 
 @njit(cache=True, nogil=True)
+def mix(
+    divided: FloatArray, early: FloatArray, late: FloatArray, mode: FloatArray, pushed: FloatArray, out: FloatArray
+) -> None:
+    """Write to [j, i] how the end of a step answers in mode i to a change of A from mode j to i, in one pass over memory.
+
+    ``mode`` and ``pushed`` (2, n) are the modes at both ends of the step and f less A there.
+    """
+    for j in range(early.size):
+        for i in range(early.size):
+            out[j, i] = (
+                (divided[0, j, i] - early[i]) * mode[0, j]
+                + divided[1, j, i] * pushed[0, j]
+                + divided[2, j, i] * pushed[1, j]
+                - late[i] * mode[1, j]
+            )
+
+
+@njit(cache=True, nogil=True)
+def turn(
+    turned: IntArray,
+    row: IntArray,
+    column: IntArray,
+    value: FloatArray,
+    into: FloatArray,
+    through: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Add what every entry of the dA does to the modes, to row ``turned`` of (n_columns, n).
+
+    ``into`` is inward transposed, ``through`` outward times what ``mix`` writes.
+    """
+    for e in range(turned.size):
+        t, first, second, factor = turned[e], row[e], column[e], value[e]
+        for i in range(into.shape[1]):
+            out[t, i] += factor * into[first, i] * through[second, i]
+
+
+@njit(cache=True, nogil=True)
 def _add_turned(
     turns: Turning,
     modes: Modes,
@@ -69,17 +107,13 @@ def _add_turned(
 ) -> None:
     """Add outward ((inward dA outward) * mixed^T) 1 of every column that changes A to its column of ``columns``, (n, n_columns).
 
-    ``mixed`` [j, i] is how the end of a step answers in mode i to a change of A from mode j to i; ``into`` and ``outof`` are
-    inward and outward transposed, ``through`` (n, n) and ``pushed`` (2, n_turned, n) are for its use. The dA are taken entry by
-    entry, for a coupling has four of them.
+    ``mixed`` is what ``mix`` writes; ``into`` and ``outof`` are inward and outward transposed, ``through`` (n, n) and ``pushed``
+    (2, n_turned, n) are for its use. The dA are taken entry by entry, for a coupling has four of them.
     """
     n = into.shape[0]
     product(modes.outward, mixed, through)
     pushed[0] = 0.0
-    for e in range(turns.which.size):
-        t, row, column, value = turns.which[e], turns.row[e], turns.column[e], turns.value[e]
-        for i in range(n):
-            pushed[0, t, i] += value * into[row, i] * through[column, i]
+    turn(turns.which, turns.row, turns.column, turns.value, into, through, pushed[0])
     product(pushed[0], outof, pushed[1])
     for i in range(n):
         for t in range(turns.columns.size):
@@ -218,15 +252,7 @@ def march_sensitivities(
                 multiply(modes.inward, rate[k, side], g[side])
                 for i in range(n):
                     g[side, i] -= modes.rate_per_s[i] * mode[side, i]
-            for j in range(n):
-                for i in range(n):
-                    mixed[j, i] = (
-                        divided[0, j, i] * mode[0, j]
-                        + divided[1, j, i] * g[0, j]
-                        + divided[2, j, i] * g[1, j]
-                        - early[i] * mode[0, j]
-                        - late[i] * mode[1, j]
-                    )
+            mix(divided, early, late, mode, g, mixed)
             _add_turned(turns, modes, into, outof, mixed, through, pushed, work)
         matrix[:] = 0.0
         _add_product(dense_late, row, column, entry[k, 1], matrix)

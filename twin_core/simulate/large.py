@@ -12,6 +12,7 @@ from numba import njit
 from scipy.linalg import qr
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.simulate.derivatives import mix, turn
 from twin_core.simulate.modes import Modes, Turning, divided_differences, weights
 
 MANY = 48
@@ -54,33 +55,6 @@ def _spanned(columns: FloatArray, least: float) -> tuple[FloatArray, FloatArray]
     return basis[:, :rank], shares
 
 
-@njit(cache=True, nogil=True)
-def _mix(
-    divided: FloatArray, early: FloatArray, late: FloatArray, mode: FloatArray, pushed: FloatArray, out: FloatArray
-) -> None:
-    """Write how the end of a step answers in mode i to a change of A from mode j to i, (n, n), in one pass over memory."""
-    for i in range(early.size):
-        for j in range(early.size):
-            out[i, j] = (divided[0, i, j] - early[i]) * mode[0, j] - late[i] * mode[1, j]
-            out[i, j] += divided[1, i, j] * pushed[0, j] + divided[2, i, j] * pushed[1, j]
-
-
-@njit(cache=True, nogil=True)
-def _turn(
-    turned: IntArray,
-    row: IntArray,
-    column: IntArray,
-    value: FloatArray,
-    inward: FloatArray,
-    through: FloatArray,
-    out: FloatArray,
-) -> None:
-    """Add sum_j (inward dA outward)[i, j] mixed[i, j] of the entries of every dA; all matrices are transposed."""
-    for e in range(turned.size):
-        for i in range(inward.shape[1]):
-            out[turned[e], i] += value[e] * inward[row[e], i] * through[column[e], i]
-
-
 class _Turned:
     """How columns change A, multiplied with what differs from step to step."""
 
@@ -93,13 +67,12 @@ class _Turned:
         self._columns = turns.columns[turns.which]
 
     def add(self, mixed: FloatArray, inward: FloatArray, out: FloatArray) -> None:
-        """Add sum_j (inward dA outward)[i, j] mixed[i, j] of every column to (n_columns, n); ``inward`` is transposed."""
+        """Add sum_j (inward dA outward)[i, j] mixed[j, i] of every column to (n_columns, n); ``inward`` is transposed."""
         turns = self._turns
         if self._dense is not None:
-            out[turns.columns] += (self._dense @ mixed[:, :, None])[:, :, 0].T
+            out[turns.columns] += (self._dense @ mixed.T[:, :, None])[:, :, 0].T
         else:
-            through = self._outward @ mixed.T
-            _turn(self._columns, turns.row, turns.column, turns.value, inward, through, out)
+            turn(self._columns, turns.row, turns.column, turns.value, inward, self._outward @ mixed, out)
 
 
 class _Beside:
@@ -186,7 +159,7 @@ def march_sensitivities_of_many(
         given = np.zeros((moved, n))
         _drive(entry_column, entry_node, series[k, 0], series[k, 1], inward, early, late, given)
         if turns.columns.size > 0:
-            _mix(divided, early, late, mode[k], pushed[k], mixed)
+            mix(divided, early, late, mode[k], pushed[k], mixed)
             turned.add(mixed, inward, given)
         forward = keep[:, None] * state + early[:, None] * beside.times(entry[k, 0], coupled)
         forward[:, :moved] += given.T
