@@ -145,7 +145,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
     told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
-    # Later on, pairs are left to the trajectories: these are many fits, and none held.
+    # After the first finding pairs are left to the trajectories: by heat they took as long again and added none.
     if not (told or fallback or state.findings):
         told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial

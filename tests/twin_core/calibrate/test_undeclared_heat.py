@@ -1,5 +1,7 @@
 """Fitting in the presence of undeclared heat: the likelihood densely, its slopes numerically, and what it recovers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -18,6 +20,7 @@ from twin_core.calibrate.undeclared.model import (
     log_likelihood,
     parameter_columns,
 )
+from twin_core.latent_force.held import grid_of
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.rollout import rollout
@@ -216,3 +219,17 @@ def test_a_fit_never_ends_below_where_it_started() -> None:
     short = fit_with_undeclared_heat(problem, n_passes=1)
     long = fit_with_undeclared_heat(problem, near=short, free=short.free, n_passes=6)
     assert long.log_posterior >= short.log_posterior - 1e-6
+
+
+def test_a_fit_to_other_readings_takes_over_none_of_their_pattern() -> None:
+    """Which intervals are alike depends on which readings there are: a fit close by may know others."""
+    problem, _ = three_nodes(2, 20.0)
+    near = fit_with_undeclared_heat(problem, n_passes=1)
+    (segment,) = problem.segments
+    measured = segment.measured_K.copy()
+    measured[10:60:3, 0] = np.nan
+    fewer = replace(problem, segments=(replace(segment, measured_K=measured),))
+    fit = fit_with_undeclared_heat(fewer, near=near, free=near.free, n_passes=1)
+    (nominal,) = fit.nominals
+    afresh = grid_of(segment.forcing.step_s, nominal.sample_of, fewer.segments[0].valid)
+    np.testing.assert_array_equal(nominal.grid.interval, afresh.interval)

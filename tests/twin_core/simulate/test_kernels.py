@@ -6,6 +6,7 @@ from scipy.linalg import expm
 
 from twin_core.simulate.derivatives import march_sensitivities, transitions
 from twin_core.simulate.kernels import NOT_NEAR, Remainder, march
+from twin_core.simulate.matrices import FEW, product
 from twin_core.simulate.modes import Modes, Turning, phi
 from twin_core.simulate.relays import N_KICK, NO_RELAYS
 from twin_core.simulate.splitting import entries, modes_of
@@ -197,6 +198,14 @@ def test_sensitivities_are_the_derivative_of_the_scheme_that_of_a_included() -> 
         scale = np.abs(states).max()
         np.testing.assert_allclose(found[:, :, c], states[samples][:, observed], atol=1e-6 * scale)
         np.testing.assert_allclose(end[:, c], states[-1], atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("n", [1, FEW - 1, FEW, 30])
+def test_a_product_is_that_of_numpy(n: int) -> None:
+    rng = np.random.default_rng(n)
+    matrix, columns, out = rng.normal(size=(n + 2, n)), rng.normal(size=(n, 7)), np.full((n + 2, 7), np.nan)
+    product(matrix, columns, out)
+    np.testing.assert_allclose(out, matrix @ columns, atol=1e-13 * n)
 
 
 def test_transitions_are_the_derivative_of_single_steps() -> None:

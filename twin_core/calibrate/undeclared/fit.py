@@ -269,10 +269,8 @@ def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[
     fresh = []
     for nominal, segment in zip(near.nominals, problem.segments, strict=True):
         states = states_of(nominal)[:, source]
-        fresh.append(
-            linearise(
-                problem, values, segment, states, np.where(own, nominal.extra_W[:, source], 0.0), grid=nominal.grid
-            )
-        )
+        extra_W = np.where(own, nominal.extra_W[:, source], 0.0)
+        same = np.array_equal(nominal.segment.valid, segment.valid)
+        fresh.append(linearise(problem, values, segment, states, extra_W, grid=nominal.grid if same else None))
     std = np.where(own, near.undeclared.std_W[source], 1e-6)
     return tuple(fresh), UndeclaredHeat(std, near.undeclared.length_s)
