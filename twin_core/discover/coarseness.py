@@ -12,8 +12,8 @@ def by_chance(n_readings: int) -> float:
     return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
 
 
-def least_explained(beside: float, left: float, n_readings: int) -> float:
-    """Return the variance that names must explain, in units of the sensors' noise.
+def least_explained(beside: float, left: float, n_readings: int, *, is_named: bool = True) -> float:
+    """Return the variance that effects must explain, in units of the sensors' noise.
 
     Parameters
     ----------
@@ -24,9 +24,12 @@ def least_explained(beside: float, left: float, n_readings: int) -> float:
         a standard error of sqrt(2 / n), the network is seen to be coarse.
     n_readings
         How many there are.
+    is_named
+        Whether names are asked: against a heat without a name, which could be all of it, whatever stays counts.
     """
     shown = min(max(left / by_chance(n_readings) - 1.0, 0.0), 1.0)
-    return policy.DOMINANCE * min(max(beside, shown * policy.LEAST_COARSENESS), policy.MOST_COARSENESS)
+    coarseness = max(beside, shown * policy.LEAST_COARSENESS)
+    return policy.DOMINANCE * (min(coarseness, policy.MOST_COARSENESS) if is_named else coarseness)
 
 
 def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = True) -> float:

@@ -55,7 +55,7 @@ def withdraw(state: Search, needed: float) -> None:
             places = finding.judged.places
             is_named = not all(effect.fallback for effect in finding.effects)
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
-            asked[places] = least_explained(left, left, n_readings) if is_named else policy.DOMINANCE * left
+            asked[places] = least_explained(left, left, n_readings, is_named=is_named)
         without = _without_each(state, asked)
         named = {f.judged.places for f in state.findings if not all(effect.fallback for effect in f.effects)}
         told = {

@@ -241,17 +241,23 @@ def test_of_effects_found_together_each_must_explain_something(
     assert asked == ([] if len(kept) == 2 else [both[1:]])
 
 
-@pytest.mark.parametrize(("explained", "stands"), [(DOMINANCE * 50.0, True), (DOMINANCE * 50.0 - JUST, False)])
+@pytest.mark.parametrize(
+    ("left", "asked"),
+    [(50.0, DOMINANCE * 50.0), (2.0 * CHANCE, DOMINANCE * LEAST), (LEAST + 0.5, DOMINANCE * (LEAST + 0.5))],
+    ids=["much stays", "the network is seen to be coarse", "more stays than such a network may leave"],
+)
 def test_beside_a_heat_without_a_name_all_that_stays_counts(
-    monkeypatch: pytest.MonkeyPatch, explained: float, stands: bool
+    monkeypatch: pytest.MonkeyPatch, left: float, asked: float
 ) -> None:
+    """And no less than against a name: a healthy spacecraft of which the network is coarse lacks no heat."""
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     free = unnamed()
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
-    state = Search(stub(free, left=50.0), stub(left=50.0 + explained))
-    state.findings = [Finding(option)]
-    withdraw(state, NEEDED)
-    assert bool(state.findings) == stands
+    for more, stands in ((JUST, True), (-JUST, False)):
+        state = Search(stub(free, left=left), stub(left=left + asked + more))
+        state.findings = [Finding(option)]
+        withdraw(state, NEEDED)
+        assert bool(state.findings) == stands
 
 
 @pytest.mark.parametrize(
