@@ -253,11 +253,11 @@ def test_beside_a_heat_without_a_name_all_that_stays_counts(
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
     free = unnamed()
     option = Judged((free,), Evidence(50.0, 0.0), stub(free))
-    for more, stands in ((JUST, True), (-JUST, False)):
+    for more, kept in ((JUST, True), (-JUST, False)):
         state = Search(stub(free, left=left), stub(left=left + asked + more))
         state.findings = [Finding(option)]
         withdraw(state, NEEDED)
-        assert bool(state.findings) == stands
+        assert bool(state.findings) == kept
 
 
 @pytest.mark.parametrize(
