@@ -19,6 +19,7 @@ from twin_core.discover.confirm import (
     Trial,
     about_trajectory,
     mean_excess,
+    resettled,
     shared_unknowns,
     try_on_trajectories,
     weigh,
@@ -59,15 +60,19 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
 
     about = [about_trajectory(start.problem, start.optimum) for start in starts]
     fits = [(simple.fit, starts[0]), *zip(about, starts, strict=True)]
+
+    def in_place(effect: Effect) -> str:
+        return f"{effect.label} instead of {own.label}"
+
     options = [(start, effect) for fit, start in fits for effect in _near(simple, fit, own, known)]
+    fitted = state.attempt_each(
+        [(partial(_explaining, simple, start, effect, least), in_place(effect)) for start, effect in options]
+    )
+    best: dict[Place, Trial] = {}
+    for trial in sorted((trial for trial in fitted if trial is not None), key=mean_excess):
+        best.setdefault(trial.effects[-1].place, trial)
     told = state.attempt_each(
-        [
-            (
-                partial(_explaining, state, simple, start, effect, least, needed),
-                f"{effect.label} instead of {own.label}",
-            )
-            for start, effect in options
-        ]
+        [(partial(_supported, state, simple, t, needed), in_place(t.effects[-1])) for t in best.values()]
     )
     return Finding(finding.judged, (*finding.alternatives, *once_each([j for j in told if j is not None])))
 
@@ -101,13 +106,21 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
     return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
 
 
-def _explaining(
-    state: Search, simple: Trial, start: Calibration, effect: Effect, least: float, needed: float
-) -> Judged | None:
-    """Return an effect on top of a trial if it is supported and explains at least so much of the misfit."""
+def _explaining(simple: Trial, start: Calibration, effect: Effect, least: float) -> Trial | None:
+    """Return an effect on top of a trial, fitted on trajectories, if it explains at least so much of the misfit."""
     trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
-    if trial is None or mean_excess(simple) - mean_excess(trial) < least:
-        return None
-    own = tuple(e for e in trial.effects if e.place == effect.place)
-    evidence = weigh(simple, trial, max(state.n_named, 1))
-    return Judged(own, evidence, trial) if evidence.log_bayes_factor > needed else None
+    return None if trial is None or mean_excess(simple) - mean_excess(trial) < least else trial
+
+
+def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:
+    """Return the last effect of a trial that was fitted on trajectories if the readings support it.
+
+    The undeclared heat beside it is a first guess, while the simpler model's was fitted: where that speaks against the effect, it
+    is fitted too.
+    """
+    n_tried = max(state.n_named, 1)
+    evidence = weigh(simple, trial, n_tried)
+    if evidence.log_bayes_factor <= needed:
+        trial = resettled(simple, trial)
+        evidence = weigh(simple, trial, n_tried)
+    return Judged(trial.effects[-1:], evidence, trial) if evidence.log_bayes_factor > needed else None

@@ -1,0 +1,103 @@
+"""Alternatives in a coarse network: each place is asked once, from its best fit, and weighed with its heat fitted if need be."""
+
+from typing import Any
+
+import pytest
+
+from tests.twin_core.discover.stubs import CHANCE, JUST, NEEDED, judged, load, stub
+from twin_core.discover import alternatives
+from twin_core.discover.alternatives import add_coarse_alternatives
+from twin_core.discover.confirm import Evidence, Trial
+from twin_core.discover.judge import Finding, Search
+from twin_core.discover.policy import REPEATABLE_SHARE
+from twin_core.effects.base import Effect
+
+BEFORE, LEFT = 10.0, 2.0
+MOST_LEFT = LEFT + REPEATABLE_SHARE * (BEFORE - LEFT)
+
+
+class Fits:
+    """Fits of one effect at node ``b`` from two starts, what they leave, and their nats before and after settling."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], nats: tuple[float, float]) -> None:
+        self.rough, self.fine = {"s0": left[0], "s1": left[1]}, nats
+        self.settled: list[float] = []
+        starts: list[Any] = [
+            type("Start", (), {"problem": None, "optimum": None, "name": name})() for name in self.rough
+        ]
+        self.simple: Any = stub(left=BEFORE)
+        self.simple.present_effects, self.simple.calibration = (), lambda: starts[0]
+        self.found = self.with_a(LEFT)
+        for name, value in {
+            "_bare": lambda simple, found: starts[1],
+            "about_trajectory": lambda problem, optimum: None,
+            "_near": lambda simple, fit, own, known: [load("b")],
+            "try_on_trajectories": self.tried,
+            "resettled": self.resettled,
+            "weigh": lambda simple, rich, n_tried: Evidence(rich.nats, 0.0),
+        }.items():
+            monkeypatch.setattr(alternatives, name, value)
+        monkeypatch.setattr(Search, "attempt_each", lambda state, works: [work() for work, _ in works])
+
+    def with_a(self, left: float) -> Any:
+        found: Any = stub(load("a"), left=left)
+        found.calibration = self.simple.calibration
+        return found
+
+    def trial(self, left: float, nats: float) -> Any:
+        made: Any = stub(load("b"), left=left)
+        made.nats = nats
+        return made
+
+    def tried(self, simple: Trial, effects: tuple[Effect, ...], start: Any) -> Any:
+        return self.trial(self.rough[start.name], self.fine[0])
+
+    def resettled(self, simple: Trial, rich: Any) -> Any:
+        self.settled.append(alternatives.mean_excess(rich))
+        return self.trial(alternatives.mean_excess(rich), self.fine[1])
+
+    def told(self) -> list[str]:
+        finding = Finding(judged("a", 50.0))
+        state = Search(self.found, self.simple, findings=[finding])
+        made = add_coarse_alternatives(state, self.simple, finding, NEEDED)
+        return [str(j.effects[0].where["node"]) for j in made.alternatives]
+
+
+@pytest.mark.parametrize(
+    ("nats", "settles", "told"),
+    [
+        ((NEEDED + JUST, -9.0), False, ["b"]),
+        ((-133.0, NEEDED + JUST), True, ["b"]),
+        ((NEEDED, NEEDED), True, []),
+    ],
+    ids=["supported as it is", "by a fitted heat only", "not supported"],
+)
+def test_an_alternative_is_weighed_with_its_heat_fitted_where_the_first_guess_speaks_against_it(
+    monkeypatch: pytest.MonkeyPatch, nats: tuple[float, float], told: list[str], *, settles: bool
+) -> None:
+    """Beside a first guess a leak that leaves as little as radiation was less likely than nothing, by 134 nats."""
+    fits = Fits(monkeypatch, (LEFT + 0.1, LEFT), nats)
+    assert fits.told() == told
+    assert fits.settled == ([LEFT] if settles else [])
+
+
+@pytest.mark.parametrize(
+    ("left", "told"),
+    [
+        ((MOST_LEFT - JUST, BEFORE), ["b"]),
+        ((MOST_LEFT + JUST, BEFORE), []),
+        ((BEFORE, MOST_LEFT - JUST), ["b"]),
+    ],
+    ids=["enough", "too little", "from the parameters found"],
+)
+def test_an_alternative_explains_all_but_a_tenth(
+    monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], told: list[str]
+) -> None:
+    assert Fits(monkeypatch, left, (9.0, 9.0)).told() == told
+
+
+@pytest.mark.parametrize("left", [CHANCE, CHANCE + JUST])
+def test_where_only_chance_is_left_the_evidence_alone_tells(monkeypatch: pytest.MonkeyPatch, left: float) -> None:
+    fits = Fits(monkeypatch, (left, left), (9.0, 9.0))
+    fits.found = fits.with_a(left)
+    assert fits.told() == ([] if left <= CHANCE else ["b"])
