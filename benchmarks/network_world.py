@@ -10,6 +10,9 @@ from scipy.integrate import solve_ivp
 SIGMA = 5.670374419e-8
 SPACE_K = 2.7
 
+HOTTEST_K = 1000.0
+"""No spacecraft: a heat that grows with its own temperature has run away, and no integrator would come to an end."""
+
 Heat = Callable[[float, int, np.ndarray], np.ndarray]
 """(time in s, sample, states) -> W into every node."""
 
@@ -122,10 +125,12 @@ class World:
         return lambda k, x: heat[k] + laplacian @ x + SIGMA * area * (SPACE_K**4 - x**4)
 
     def simulate(self, hidden: Hidden = NOTHING) -> np.ndarray:
-        """Return the true temperatures, (n_times, n + extra)."""
+        """Return the true temperatures, (n_times, n + extra); ArithmeticError where what is hidden runs away with them."""
         declared = self._declared_rates()
 
         def rates(t: float, state: np.ndarray, k: int) -> np.ndarray:
+            if not state[: self.n].max() < HOTTEST_K:
+                raise ArithmeticError(f"a node passes {HOTTEST_K:g} K at {t:g} s: what is hidden runs away")
             q = declared(k, state[: self.n])
             if hidden.heat is not None:
                 q = q + hidden.heat(t, k, state)

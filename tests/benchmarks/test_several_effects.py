@@ -112,3 +112,14 @@ def test_a_written_case_is_read_as_it_was(tmp_path: Path) -> None:
     assert (again.spec, again.truths, again.noise_K) == (case.spec, case.truths, case.noise_K)
     np.testing.assert_array_equal(again.truth_K, case.truth_K)
     assert all(np.array_equal(again.record.values[k], v) for k, v in case.record.values.items())
+
+
+def test_a_heat_that_runs_away_ends_with_its_reason() -> None:
+    """A gain that feeds itself grows without end: the integrator would take ever smaller steps."""
+    own = world()
+
+    def heat(t: float, k: int, state: np.ndarray) -> np.ndarray:
+        return 100.0 * (state[: own.n] - 280.0)
+
+    with pytest.raises(ArithmeticError, match=r"passes 1000 K at .* s: what is hidden runs away"):
+        states(Hidden({}, heat))
