@@ -11,7 +11,7 @@ SIGMA = 5.670374419e-8
 SPACE_K = 2.7
 
 HOTTEST_K = 1000.0
-"""No spacecraft: a heat that grows with its own temperature has run away, and no integrator would come to an end."""
+"""No spacecraft: a heat that feeds on its own temperature has run away, up or below 0 K, and no integrator would come to an end."""
 
 Heat = Callable[[float, int, np.ndarray], np.ndarray]
 """(time in s, sample, states) -> W into every node."""
@@ -129,8 +129,6 @@ class World:
         declared = self._declared_rates()
 
         def rates(t: float, state: np.ndarray, k: int) -> np.ndarray:
-            if not state[: self.n].max() < HOTTEST_K:
-                raise ArithmeticError(f"a node passes {HOTTEST_K:g} K at {t:g} s: what is hidden runs away")
             q = declared(k, state[: self.n])
             if hidden.heat is not None:
                 q = q + hidden.heat(t, k, state)
@@ -144,6 +142,10 @@ class World:
         states = [state]
         for k in range(self.time_s.size - 1):
             state = _advance(rates, self.time_s[k], self.time_s[k + 1], state, k, hidden.switch)
+            if not np.all((state[: self.n] > 0.0) & (state[: self.n] < HOTTEST_K)):
+                raise ArithmeticError(
+                    f"a node leaves 0 to {HOTTEST_K:g} K by {self.time_s[k + 1]:g} s: what is hidden runs away"
+                )
             states.append(state)
         return np.array(states)
 
