@@ -50,14 +50,13 @@ def withdraw(state: Search, needed: float) -> None:
         left, n_readings = mean_excess(state.trial), state.trial.n_samples
         if left <= by_chance(n_readings):
             return
+        named = {f.judged.places for f in state.findings if not all(effect.fallback for effect in f.effects)}
         asked: dict[frozenset[object], float] = {}
         for finding in state.findings:
             places = finding.judged.places
-            is_named = not all(effect.fallback for effect in finding.effects)
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
-            asked[places] = least_explained(left, left, n_readings, is_named=is_named)
+            asked[places] = least_explained(left, left, n_readings, is_named=places in named)
         without = _without_each(state, asked)
-        named = {f.judged.places for f in state.findings if not all(effect.fallback for effect in f.effects)}
         told = {
             places: times_asked(kept[0], state.trial, asked[places], is_named=places in named)
             for places, kept in without.items()
