@@ -11,7 +11,7 @@ SIGMA = 5.670374419e-8
 SPACE_K = 2.7
 
 HOTTEST_K = 1000.0
-"""No spacecraft: a heat that feeds on its own temperature has run away, up or below 0 K, and no integrator would come to an end."""
+"""No spacecraft: a heat that feeds on its own temperature has run away, up or below 0 K, and no integrator would end."""
 
 Heat = Callable[[float, int, np.ndarray], np.ndarray]
 """(time in s, sample, states) -> W into every node."""
