@@ -157,9 +157,10 @@ def _explains_nothing(without: Trial, trial: Trial) -> bool:
 def reconsider(state: Search, needed: float) -> None:
     """Name an option that was refused for the little heat that it leaves, if what was found instead is no better.
 
-    Nothing was found, a heat without a name, or one name that is less likely and predicts worse. The likeliest such option is
-    named that stands whole: what a part of it explains beside a coarse network may be no effect of its own. A search that was
-    cut short may have left out a better one, so that what it refused stays refused.
+    Nothing was found, a heat without a name that predicts no better or hardly explains more beside a coarse network, or one name
+    that is less likely and predicts worse. The likeliest such option is named that stands whole: what a part of it explains
+    beside a coarse network may be no effect of its own. A search that was cut short may have left out a better one, so that what
+    it refused stays refused.
     """
     if len(state.findings) > 1 or state.left_out:
         return
@@ -176,10 +177,23 @@ def reconsider(state: Search, needed: float) -> None:
         instead = replace(state, trial=option.trial, findings=[Finding(replace(option, reason=""))], rejected=rest)
         withdraw(instead, needed)
         stands_whole = [len(f.effects) for f in instead.findings] == [len(option.effects)]
-        if stands_whole and all(_is_better(instead.findings[0], other) for other in state.findings):
+        as_much = not named and _explains_as_much(state.base, instead.trial, state.trial)
+        if stands_whole and (as_much or all(_is_better(instead.findings[0], other) for other in state.findings)):
             instead.rejected += [replace(f.judged, reason=OUTDONE) for f in named]
             state.join(instead)
             return
+
+
+def _explains_as_much(simple: Trial, named: Trial, heat: Trial) -> bool:
+    """Return whether a name explains all but a little of what a heat without one explains, where the network is coarse.
+
+    What stays beside the heat is then visible and no more than coarseness, which leans towards whatever has more freedom.
+    """
+    left = mean_excess(heat)
+    if not by_chance(heat.n_samples) < left <= policy.MOST_COARSENESS:
+        return False
+    without = mean_excess(simple)
+    return without - mean_excess(named) >= (1.0 - policy.REPEATABLE_SHARE) * (without - left)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

@@ -34,6 +34,7 @@ from twin_core.discover.policy import (
     DOMINANCE,
     FORESIGHT,
     LEAST_EXCESS,
+    REPEATABLE_SHARE,
     THRESHOLDS,
 )
 from twin_core.discover.revision import (
@@ -285,6 +286,31 @@ def test_what_leaves_little_is_named_where_no_heat_predicts_as_well(
     assert [effect.fallback for f in state.findings for effect in f.effects] == [not named]
     assert [j.effects[0].where["node"] for j in state.rejected] == (["c", "b"] if named else ["c", "b", "a"])
     assert (state.trial is likely.trial) == named
+
+
+@pytest.mark.parametrize(
+    ("left", "explained", "named"),
+    [
+        (2.0 * CHANCE, 1.0 - REPEATABLE_SHARE + JUST, True),
+        (2.0 * CHANCE, 1.0 - REPEATABLE_SHARE - JUST, False),
+        (CHANCE, 1.0, False),
+        (MOST, 1.0, True),
+        (MOST + JUST, 1.0, False),
+    ],
+    ids=["coarse", "explains less", "not seen to be coarse", "coarsest", "more than coarse"],
+)
+def test_a_name_that_explains_as_much_goes_before_a_heat_without_one_where_a_network_is_coarse(
+    monkeypatch: pytest.MonkeyPatch, left: float, explained: float, *, named: bool
+) -> None:
+    """Nats, and a foresight a little better, say nothing there, and the heat has more freedom."""
+    monkeypatch.setattr(revision, "withdraw", lambda state, needed: None)
+    before = 40.0
+    heat = replace(judged("f", 200.0, left=left, foresight=0.45), effects=(unnamed(),))
+    option = judged("a", 90.0, left=before - explained * (before - left), foresight=0.5)
+    state = Search(heat.trial, stub(left=before), findings=[Finding(heat)])
+    state.rejected = [replace(option, reason=SMALL_REMAINDER)]
+    reconsider(state, NEEDED)
+    assert [effect.fallback for f in state.findings for effect in f.effects] == [not named]
 
 
 @pytest.mark.parametrize(
