@@ -10,7 +10,7 @@ import numpy as np
 from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.effects.base import Effect, touched_nodes
-from twin_core.side_by_side import side_by_side
+from twin_core.side_by_side import both, side_by_side
 
 N_REFITS, N_RIVALS = 6, 2
 
@@ -47,19 +47,17 @@ def repeatable_heat(trial: Trial, nodes: Collection[str], needed: float) -> Repe
     needed
         Log Bayes factor from which a free form is worth a refit.
     """
-    best, n_tried = _free_forms(trial, nodes, needed)
-    for top in _likeliest(trial, _refitted(trial, best[:N_REFITS])):
-        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, mean_excess(trial) - mean_excess(top))
-    return Repeatable()
+    forms, n_tried = _free_forms(trial, nodes, needed)
+    return _repeatable(trial, _refitted([(trial, form) for form in forms[:N_REFITS]]), n_tried)
 
 
-def outdone_by_a_free_form(
-    simple: Trial, trial: Trial, effects: Sequence[Effect], needed: float, most: float
-) -> float | None:
-    """Return what a free form of temperature removes more than named effects in whose place it is, if it is far likelier.
+def against_free_forms(
+    simple: Trial, trial: Trial, nodes: Collection[str], effects: Sequence[Effect], needed: float, most: float
+) -> tuple[Repeatable, float | None]:
+    """Return what a free form of temperature removes beside named effects, and what one in their place removes more.
 
-    Where the heat visits one flank of a curve, another law with a kink or two comes near all of it: what is left then is
-    small beside the heat, but the free form needs none of it.
+    The latter only where it is far likelier: where the heat visits one flank of a curve, another law with a kink or two comes
+    near all of it: what is left then is small beside the heat, but the free form needs none of it.
 
     Parameters
     ----------
@@ -67,6 +65,8 @@ def outdone_by_a_free_form(
         Without the effects.
     trial, effects
         With the effects, fitted, and those that are to be named.
+    nodes
+        Where a free form beside them may act.
     needed
         Log Bayes factor from which a free form is worth a refit.
     most
@@ -74,12 +74,29 @@ def outdone_by_a_free_form(
 
     Returns
     -------
+    Repeatable
     float, or None
         Variance of open-loop residuals, in units of the sensors' noise, mean over sensors.
     """
-    best, _ = _free_forms(simple, acts_at(simple, effects), needed)
-    instead = _likeliest(simple, _refitted(simple, best[:N_RIVALS]))
-    likelier = [rival for rival in instead if weigh(rival, trial, 1).log_bayes_factor < -most]
+    (beside, n_tried), (instead, _) = both(
+        partial(_free_forms, trial, nodes, needed), partial(_free_forms, simple, acts_at(simple, effects), needed)
+    )
+    beside, instead = beside[:N_REFITS], instead[:N_RIVALS]
+    fits = _refitted([*((trial, form) for form in beside), *((simple, form) for form in instead)])
+    left, rivals = fits[: len(beside)], fits[len(beside) :]
+    return both(partial(_repeatable, trial, left, n_tried), partial(_removed_more, simple, trial, rivals, most))
+
+
+def _repeatable(trial: Trial, options: Sequence[Trial], n_tried: int) -> Repeatable:
+    """Return what the likeliest of some trials with a free form on top removes."""
+    for top in _likeliest(trial, options):
+        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, mean_excess(trial) - mean_excess(top))
+    return Repeatable()
+
+
+def _removed_more(simple: Trial, trial: Trial, rivals: Sequence[Trial], most: float) -> float | None:
+    """Return what the likeliest rival of a trial removes more than it, if it is far likelier."""
+    likelier = [r for r in _likeliest(simple, rivals) if weigh(r, trial, 1).log_bayes_factor < -most]
     return max((mean_excess(trial) - mean_excess(rival) for rival in likelier), default=None)
 
 
@@ -102,9 +119,9 @@ def more_is_left_elsewhere(
     return away > needed and away > (here or repeatable_heat(trial, own, needed)).log_bayes_factor
 
 
-def _refitted(trial: Trial, effects: Sequence[Effect]) -> list[Trial]:
-    """Return a trial with each of some effects on top, side by side."""
-    return side_by_side([partial(try_effects, trial, (*trial.effects, effect), n_passes=6) for effect in effects])
+def _refitted(options: Sequence[tuple[Trial, Effect]]) -> list[Trial]:
+    """Return trials with an effect on top of each, side by side."""
+    return side_by_side([partial(try_effects, trial, (*trial.effects, e), n_passes=6) for trial, e in options])
 
 
 def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
@@ -120,6 +137,8 @@ def acts_at(trial: Trial, effects: Sequence[Effect]) -> set[str]:
 def _free_forms(trial: Trial, nodes: Collection[str], needed: float) -> tuple[list[Effect], int]:
     """Return the free forms on top of a trial at some nodes, the best first, and how many places."""
     n_tried, best = 1, dict[object, tuple[float, Effect]]()
+    if not nodes:
+        return [], n_tried
     for screening in screened(trial, trial.fit, UNDECLARED_SHARES, fallback=True, nodes=nodes):
         n_tried = max(n_tried, len({probe.effect.place for probe in screening.probes}))
         for probe in screening.probes:

@@ -12,12 +12,12 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
-from twin_core.discover.form import Repeatable, acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
+from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
-from twin_core.side_by_side import ahead, both
+from twin_core.side_by_side import ahead
 from twin_core.simulate.rollout import hurried
 
 T = TypeVar("T")
@@ -298,14 +298,7 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     heats = [effect for effect in named if "sensor" not in effect.where]
     most = most_left(judged.evidence.log_bayes_factor, needed)
     trial = judged.trial
-
-    def what_is_left() -> Repeatable:
-        return repeatable_heat(trial, acts_at(trial, heats), needed) if heats else Repeatable()
-
-    def what_outdoes() -> float | None:
-        return outdone_by_a_free_form(simple, trial, named, needed, most)
-
-    beside, other = both(what_is_left, what_outdoes)
+    beside, other = against_free_forms(simple, trial, acts_at(trial, heats), named, needed, most)
     left = [beside.removed] if beside.log_bayes_factor > most else []
     left += [other] if other is not None else []
     if not left or more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):

@@ -272,8 +272,7 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     simple = stub(left=10.0 if left == 1.0 else left)
     found = Repeatable() if beside is None else Repeatable(9e9, beside)
     monkeypatch.setattr(judge, "acts_at", lambda *arguments: {"a"})
-    monkeypatch.setattr(judge, "repeatable_heat", lambda *arguments: found)
-    monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: instead)
+    monkeypatch.setattr(judge, "against_free_forms", lambda *arguments: (found, instead))
     monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
     assert judge._merely_resembles(simple, option, NEEDED) == reason
     monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: True)
@@ -284,11 +283,11 @@ def test_beside_much_that_stays_as_large_a_share_is_little(monkeypatch: pytest.M
     """What stays beside name and heat is no coarseness: a heat of a share of it does not tell the law wrong."""
     option = judged("a", 90.0, left=100.0)
     monkeypatch.setattr(judge, "acts_at", lambda *arguments: {"a"})
-    monkeypatch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
     monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
     at_most = REPEATABLE_SHARE * 100.0 / (1.0 + REPEATABLE_SHARE)
     for removed, reason in ((at_most - JUST, SMALL_REMAINDER), (at_most + JUST, NO_LAW)):
-        monkeypatch.setattr(judge, "repeatable_heat", lambda *a, removed=removed: Repeatable(9e9, removed))
+        found = Repeatable(9e9, removed), None
+        monkeypatch.setattr(judge, "against_free_forms", lambda *a, found=found: found)
         assert judge._merely_resembles(stub(left=9000.0), option, NEEDED) == reason
 
 
@@ -298,10 +297,17 @@ def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
     option = Judged((lag,), Evidence(90.0, 0.0), stub(lag))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
-        patch.setattr(judge, "repeatable_heat", lambda *arguments: Repeatable(9e9, 1e9))
-        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: None)
+        patch.setattr(judge, "acts_at", lambda trial, effects: {"a"} if effects else set())
+
+        def compared(
+            simple: object, trial: object, nodes: set[str], *others: object
+        ) -> tuple[Repeatable, float | None]:
+            return Repeatable(9e9, 1e9) if nodes else Repeatable(), instead
+
+        instead: float | None = None
+        patch.setattr(judge, "against_free_forms", compared)
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == ""
-        patch.setattr(judge, "outdone_by_a_free_form", lambda *arguments: 1e9)
+        instead = 1e9
         assert judge._merely_resembles(stub(left=10.0), option, NEEDED) == NO_LAW
 
 

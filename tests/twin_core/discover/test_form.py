@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
-from twin_core.discover.form import acts_at, more_is_left_elsewhere, outdone_by_a_free_form, repeatable_heat
+from twin_core.discover.form import Repeatable, acts_at, against_free_forms, more_is_left_elsewhere, repeatable_heat
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
 from twin_core.discover.revision import prune
 from twin_core.discover.screen import screen, survey_of
@@ -97,8 +97,12 @@ def test_a_law_that_only_resembles_the_heat_leaves_some_behind(heat_W: Callable[
     worth = weigh(base, trial, 1).log_bayes_factor
     assert worth > NEEDED  # either way the heater looks well supported
     most = most_left(worth, NEEDED)
-    assert (repeatable_heat(trial, acts_at(trial, trial.effects), NEEDED).log_bayes_factor > most) is left
-    assert (outdone_by_a_free_form(base, trial, trial.effects, NEEDED, most) is not None) is left
+    here = acts_at(trial, trial.effects)
+    beside, instead = against_free_forms(base, trial, here, trial.effects, NEEDED, most)
+    assert beside == repeatable_heat(trial, here, NEEDED)
+    assert (beside.log_bayes_factor > most) is left
+    assert (instead is not None) is left
+    assert against_free_forms(base, trial, (), trial.effects, NEEDED, most) == (Repeatable(), instead)
 
 
 @pytest.mark.parametrize("law", ["radiation", "leak", "constant"])
@@ -115,7 +119,8 @@ def test_a_smooth_law_is_not_outdone_by_the_free_form_that_contains_it(law: str)
     trial = try_effects(base, [effect], n_passes=15)
     worth = weigh(base, trial, 1).log_bayes_factor
     assert worth > NEEDED
-    assert outdone_by_a_free_form(base, trial, trial.effects, NEEDED, most_left(worth, NEEDED)) is None
+    _, instead = against_free_forms(base, trial, (), trial.effects, NEEDED, most_left(worth, NEEDED))
+    assert instead is None
 
 
 def pair_record(heats_W: Sequence[Callable[[float], float]]) -> Record:

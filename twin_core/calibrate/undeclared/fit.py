@@ -6,6 +6,7 @@ They stay where the physics is, however much heat the declaration lacks.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from twin_core.calibrate.undeclared.model import (
     whiten,
 )
 from twin_core.calibrate.undeclared.size import SizeSearch, first_size
+from twin_core.side_by_side import side_by_side
 
 EARLY_PRIOR_STD = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 """Prior deviations of logarithmic parameters in the first passes, while the undeclared heat is still too large."""
@@ -161,17 +163,19 @@ def fit_with_undeclared_heat(
         for s in problem.segments
     )
     typical = first_size(problem, first)
-    started: list[tuple[HeatFit, SizeSearch]] = []
-    for share in START_SHARES:
-        if started and is_late(deadline):
-            break
+
+    def begun(share: float) -> tuple[HeatFit, SizeSearch] | None:
+        if share != START_SHARES[0] and is_late(deadline):
+            return None
         fit = HeatFit(problem, free, replace(typical, std_W=share * typical.std_W), first, -np.inf)
         sizes = SizeSearch(FIRST_LOG_STEP)
         for most_std in early_prior_std:
             if is_late(deadline) and np.isfinite(fit.log_likelihood):
                 break
             fit = _pass(fit, sizes, most_std, smoothing=True)
-        started.append((fit, sizes))
+        return fit, sizes
+
+    started = [found for found in side_by_side([partial(begun, share) for share in START_SHARES]) if found is not None]
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
     return _settle(fit, sizes, n_passes, deadline)
 
