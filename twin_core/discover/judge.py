@@ -11,6 +11,7 @@ import numpy as np
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance, stands
+from twin_core.discover.coincidence import coinciding_channel
 from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
@@ -35,6 +36,7 @@ LESS_LIKELY = "the readings are less likely along its trajectories than along th
 NO_MODEL = "the corrected model could not be computed"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 OUTDONE = "another effect in its place explains the readings better"
+COINCIDES = "it sets in when an input changes as nowhere else, which a law of that input would look like"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
 SMALL_REMAINDER = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
@@ -280,6 +282,8 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
         return replace(judged, reason=LESS_LIKELY), False
     if least_wald_score(simple, judged.trial) < score_needed(needed):
         return replace(judged, reason=SIZE_NOT_DETERMINED), False
+    if coinciding_channel(judged.trial, judged.effects) is not None:
+        return replace(judged, reason=COINCIDES), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False

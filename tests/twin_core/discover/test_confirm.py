@@ -11,6 +11,7 @@ from scipy.stats import chi2
 
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
+from tests.twin_core.discover.stubs import stub
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
@@ -190,6 +191,26 @@ def test_evidence_pays_for_parameters_and_candidates(trials: tuple[Trial, Trial]
         evidence = weigh(base, right, tried)
         assert evidence.log_bayes_factor == pytest.approx(gain - 0.5 * np.log(400) - np.log(tried))
         assert evidence.p_value == pytest.approx(min(1.0, tried * chi2.sf(2.0 * gain, 1)))
+
+
+def test_an_instant_is_paid_for_as_one_among_all_samples() -> None:
+    """The oracle adds up the evidence of a step of unit-information prior at each of n instants, in closed form.
+
+    An instant is told to a few samples whatever n is, not to a share that falls with its root, as Schwarz has it.
+    """
+    excess = []
+    for n in (400, 4000, 40000):
+        values = np.random.default_rng(n).standard_normal(n) + np.where(np.arange(n) < 0.4 * n, 0.0, 1.0)
+        later = np.arange(n - 1, 0, -1)  # samples from each instant on
+        sums = np.cumsum(values[::-1])[::-1][1:]
+        gains = 0.5 * sums**2 / later
+        exact = logsumexp(gains * later / (later + 1.0) - 0.5 * np.log1p(later)) - np.log(n - 1.0)
+        clock = {"begin_s": 0.0, "span_s": 1.0, "width_s": 1.0, "dated": False}
+        step = REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 1.0, "time": 0.4}, clock)
+        simple, rich = stub(n_free=3), stub(step, n_free=5)
+        simple, rich = replace(simple, n_samples=n), replace(rich, n_samples=n)
+        excess.append(confirm._evidence(float(gains.max()), simple, rich, 1).log_bayes_factor - exact)
+    assert np.ptp(excess) < 1.5 and np.abs(excess).max() < 3.0
 
 
 def test_a_superfluous_effect_is_not_supported() -> None:

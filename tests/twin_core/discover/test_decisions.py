@@ -17,6 +17,7 @@ from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.confirm import Evidence, Trial, Validation
 from twin_core.discover.form import Repeatable
 from twin_core.discover.judge import (
+    COINCIDES,
     LESS_LIKELY,
     NO_FORESIGHT,
     NO_LAW,
@@ -224,12 +225,17 @@ SCORE = score_needed(NEEDED)
 
 
 @pytest.mark.parametrize(
-    ("change", "score", "reason"),
-    [(0.0, SCORE, ""), (-JUST, SCORE, LESS_LIKELY), (0.0, SCORE - JUST, SIZE_NOT_DETERMINED)],
-    ids=["both are enough", "less likely along its trajectories", "of no size"],
+    ("change", "score", "channel", "reason"),
+    [
+        (0.0, SCORE, None, ""),
+        (-JUST, SCORE, None, LESS_LIKELY),
+        (0.0, SCORE - JUST, None, SIZE_NOT_DETERMINED),
+        (0.0, SCORE, "P", COINCIDES),
+    ],
+    ids=["both are enough", "less likely along its trajectories", "of no size", "with an input"],
 )
 def test_a_correction_is_told_by_its_own_trajectories(
-    monkeypatch: pytest.MonkeyPatch, change: float, score: float, reason: str
+    monkeypatch: pytest.MonkeyPatch, change: float, score: float, channel: str | None, reason: str
 ) -> None:
     """However much heat that wanders at the nodes may speak for it."""
     option = judged("a", 900.0)
@@ -240,6 +246,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
     )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
     monkeypatch.setattr(judge, "least_wald_score", lambda *trials: score)
+    monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: channel)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
     assert judge.examine(simple, option, NEEDED)[0].reason == reason
 

@@ -1,0 +1,86 @@
+"""An event where an input changes as nowhere else: told from one elsewhere, and from one beside changes like others."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from twin_core._typing import FloatArray
+from twin_core.discover.coincidence import N_BESIDE, coinciding_channel
+from twin_core.discover.confirm import Trial
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect
+from twin_core.telemetry import Record
+
+N, STEP_S = 400, 10.0
+TIME_S = STEP_S * np.arange(N)
+ONCE = np.where(np.arange(N) < 200, 9.0, 4.0)
+OFTEN = np.where(np.arange(N) // 50 % 2 == 0, 9.0, 4.0)
+
+
+def trial(*columns: FloatArray, name: str = "P") -> Trial:
+    """Return what stands for a trial: a sensor that jumps wherever the channel does, and one record for each column."""
+    spec = SimpleNamespace(channels=("T", name), sensors=("T",))
+    records = [Record(STEP_S * np.arange(c.size), {"T": c, name: c}, None, "r") for c in columns]
+    problem = SimpleNamespace(segments=[SimpleNamespace(record=record) for record in records])
+    return cast(Trial, SimpleNamespace(fit=SimpleNamespace(network=SimpleNamespace(spec=spec), problem=problem)))
+
+
+def step_at(sample: float) -> Effect:
+    clock: dict[str, Any] = {"begin_s": 0.0, "span_s": STEP_S * N, "width_s": STEP_S, "dated": False}
+    return REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 1.0, "time": STEP_S * sample}, clock)
+
+
+@pytest.mark.parametrize(
+    ("column", "sample", "coincides"),
+    [
+        (ONCE, 199.5, True),
+        (ONCE, 199.5 + N_BESIDE - 1, True),
+        (ONCE, 199.5 + 4 * N_BESIDE, False),
+        (OFTEN, 199.5, False),
+        (np.linspace(4.0, 9.0, N), 199.5, False),
+        (np.full(N, 4.0), 199.5, False),
+        (ONCE + 0.3 * np.random.default_rng(0).standard_normal(N), 199.5, True),
+        (ONCE + np.where(np.arange(N) > 300, 2.4, 0.0), 199.5, True),
+        (ONCE + np.where(np.arange(N) > 300, 2.6, 0.0), 199.5, False),
+        (np.where(np.abs(np.arange(N) - 198) < 2, np.nan, ONCE), 199.5, True),
+        (np.full(N, np.nan), 199.5, False),
+    ],
+    ids=[
+        "with the only switching",
+        "just after it",
+        "well after it",
+        "with one of many",
+        "beside a ramp",
+        "beside a constant",
+        "a noisy channel",
+        "others half as large",
+        "others larger than half",
+        "a gap at the switching",
+        "no reading",
+    ],
+)
+def test_an_event_coincides_with_a_change_like_no_other(column: FloatArray, sample: float, *, coincides: bool) -> None:
+    assert coinciding_channel(trial(column), [step_at(sample)]) == ("P" if coincides else None)
+
+
+def test_what_has_no_instant_and_what_sensors_read_coincide_with_nothing() -> None:
+    load = REGISTRY["constant_heat_load"]({"node": "n1"}, {"Q_W": 1.0})
+    assert coinciding_channel(trial(ONCE), [load]) is None
+    assert coinciding_channel(trial(ONCE, name="T"), [step_at(199.5)]) is None
+
+
+def test_another_record_that_changes_as_much_tells_the_law() -> None:
+    """Its clock does not reach the instant."""
+    assert coinciding_channel(trial(ONCE, OFTEN[:150]), [step_at(199.5)]) is None
+    assert coinciding_channel(trial(ONCE, np.full(150, 9.0)), [step_at(199.5)]) == "P"
+
+
+@given(st.floats(1e-3, 1e3), st.floats(-1e3, 1e3), st.integers(0, N - 1))
+def test_neither_unit_nor_zero_of_a_channel_matters(scale: float, zero: float, sample: int) -> None:
+    assert coinciding_channel(trial(scale * ONCE + zero), [step_at(sample)]) == coinciding_channel(
+        trial(ONCE), [step_at(sample)]
+    )
