@@ -69,11 +69,10 @@ class Trial:
         near = list(self.near)
         if self.simpler is not None:
             values = self.fit.network.parameters.as_dict()
-            start = carried_over(self.simpler.calibration(), self.fit.problem, values)
+            simpler = self.simpler.calibration()
+            start = carried_over(simpler.problem, simpler.optimum.unknowns, self.fit.problem, values)
             near.append(minimise(self.fit.problem, start))
-        return from_heat_fit(
-            self.fit, self.max_step_s, near=near, afresh=not any(o.status == "converged" for o in near)
-        )
+        return from_heat_fit(self.fit, self.max_step_s, near=near)
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:
@@ -130,29 +129,29 @@ class Trial:
         return int(sum(n.segment.valid.sum() for n in self.fit.nominals))
 
 
-def carried_over(base: Calibration, problem: Problem, effect_values: Mapping[str, float]) -> FloatArray:
-    """Return the unknowns of a richer problem at a simpler one's optimum, effects at given values.
+def carried_over(simpler: Problem, at: FloatArray, problem: Problem, effect_values: Mapping[str, float]) -> FloatArray:
+    """Return the unknowns of a richer problem where a simpler one of the same telemetry is, effects at given values.
 
     Parameters
     ----------
-    base
-        The simpler calibration of the same telemetry.
+    simpler, at
+        The simpler problem, and its unknowns.
     problem
         The richer problem.
     effect_values
         Full parameter name -> value, for what the simpler one lacks.
     """
     parameters = problem.network.parameters.updated(effect_values)
-    before = dict(zip(base.problem.network.parameters.free_names, base.optimum.unknowns, strict=False))
+    before = dict(zip(simpler.network.parameters.free_names, at, strict=False))
     unknowns = problem.start()
     unknowns[: problem.n_free] = [
         before.get(name, own) for name, own in zip(parameters.free_names, parameters.free, strict=True)
     ]
     like = {extra.name: extra.like for extra in problem.network.extra}
-    nodes = base.problem.network.nodes
+    nodes = simpler.network.nodes
     source = [nodes.index(n if n in nodes else like[n]) for n in problem.network.nodes]
     for i in range(len(problem.segments)):
-        unknowns[problem.start_columns(i)] = base.optimum.unknowns[base.problem.start_columns(i)][source]
+        unknowns[problem.start_columns(i)] = at[simpler.start_columns(i)][source]
     return unknowns
 
 
@@ -213,18 +212,28 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
     return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
 
 
-def try_on_trajectories(base: Trial, effects: Sequence[Effect], start: Calibration | None = None) -> Trial | None:
+def try_on_trajectories(
+    base: Trial, effects: Sequence[Effect], start: Calibration | None = None, *, beside_heat: bool = False
+) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
-    Or from another ``start`` of the simpler problem. Where the balance has no solution there, what is new starts smaller; None
-    where it has none even so. The undeclared heat is sized about the result, for a later look.
+    Or from another ``start`` of the simpler problem; with ``beside_heat`` from its fit beside undeclared heat too, and
+    the better one counts: where much is missing, parameters that are to follow long trajectories alone lie far from where the
+    effect belongs. Where the balance has no solution there, what is new starts smaller; None where it has none even so. The
+    undeclared heat is sized about the result, for a later look.
     """
     problem = extended(base.fit.problem, effects)
+    along = start or base.calibration()
+    starts = [
+        (along.problem, along.optimum.unknowns),
+        *([(base.fit.problem, base.fit.unknowns())] if beside_heat else []),
+    ]
     there = {effect.place for effect in base.effects}
     for share in (1.0, *SHORTER_SHARES):
         some = [e if share == 1.0 or e.place in there else e.shortened(share) for e in effects]
         own = {p.name: p.value for effect in some for p in effect.parameters()}
-        optimum = minimise(problem, carried_over(start or base.calibration(), problem, own))
+        optima = [minimise(problem, carried_over(*simpler, problem, own)) for simpler in starts]
+        optimum = min(optima, key=lambda o: np.inf if o.status == "no_solution" else o.fit.cost)
         if optimum.status != "no_solution":
             break
     else:

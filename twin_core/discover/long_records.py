@@ -44,7 +44,8 @@ def on_all_samples(base: Trial, found: Trial) -> Trial:
     effects = found.present_effects
     problem = extended(base.fit.problem, effects)
     values = {p.name: p.value for effect in effects for p in effect.parameters()}
-    optimum = minimise(problem, carried_over(found.calibration(), problem, values))
+    calibration = found.calibration()
+    optimum = minimise(problem, carried_over(calibration.problem, calibration.optimum.unknowns, problem, values))
     if optimum.status == "no_solution":
         raise ArithmeticError(ADVICE["no_solution"])
     fit = about_trajectory(problem, optimum)

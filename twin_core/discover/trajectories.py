@@ -79,7 +79,9 @@ def extend_by_trajectory(
     # What the filter suggests beside little heat is no seed: it is far from where long trajectories point.
     close = _near_extensions(state, near, needed, fallback=fallback) if n_together == 1 else []
     works = [
-        (partial(_fitted, state, *extension), f"{extension[1].label} on trajectories") for extension in own + close
+        (partial(_fitted, state, *extension, beside_heat=heat), f"{extension[1].label} on trajectories")
+        for some, heat in ((own, False), (close, True))
+        for extension in some
     ]
     fitted = state.attempt_each(works)
     sets, best = (once_each([j for j in some if j is not None])[:N_KEPT] for some in (fitted[: len(own)], fitted))
@@ -123,9 +125,9 @@ def _near_extensions(state: Search, near: Sequence[Probe], needed: float, *, fal
     return [(state.trial, effect, n_tried) for effect in effects]
 
 
-def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int) -> Judged | None:
+def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int, *, beside_heat: bool) -> Judged | None:
     """Return one more effect on top of a trial, fitted on trajectories; None where the balance has no solution."""
-    trial = try_on_trajectories(seed, (*seed.present_effects, effect))
+    trial = try_on_trajectories(seed, (*seed.present_effects, effect), beside_heat=beside_heat)
     if trial is None:
         return None
     return _judged(state, trial, n_tried)

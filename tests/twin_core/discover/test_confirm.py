@@ -12,7 +12,9 @@ from scipy.stats import chi2
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from tests.twin_core.discover.stubs import stub
-from twin_core.calibrate.optimise import minimise
+from twin_core._typing import FloatArray
+from twin_core.calibrate.optimise import Optimum, minimise
+from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
 from twin_core.discover import confirm
@@ -80,6 +82,32 @@ def test_an_effect_that_leaves_no_heat_balance_where_it_starts_starts_smaller() 
     trial = confirm.try_on_trajectories(base, (chill,))
     assert trial is not None
     assert trial.effects[0].values["Q_W"] == pytest.approx(level_W, rel=0.02)
+
+
+def test_trajectories_are_fitted_from_where_the_undeclared_heat_left_the_parameters_too(
+    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Much may be missing: then parameters that had to follow long trajectories alone lie far from where an effect belongs."""
+    base, right = trials
+    capacity = base.fit.problem.network.parameters.free_names.index("C:n0")
+    astray = base.calibration().optimum.unknowns.copy()
+    astray[capacity] += 3.0
+    lost = replace(base.calibration(), optimum=replace(base.calibration().optimum, unknowns=astray))
+    started: list[float] = []
+
+    def caught(problem: Problem, unknowns: FloatArray) -> Optimum:
+        """Return where a search ends that leaves no valley: where it has begun."""
+        started.append(float(unknowns[problem.network.parameters.free_names.index("C:n0")]))
+        return minimise(problem, unknowns, max_iterations=0)
+
+    monkeypatch.setattr(confirm, "minimise", caught)
+    effect = right.effects[0]
+    for beside_heat, begun in ((False, [astray[capacity]]), (True, [astray[capacity], base.fit.free[capacity]])):
+        started.clear()
+        trial = confirm.try_on_trajectories(base, (effect,), lost, beside_heat=beside_heat)
+        assert trial is not None and started == begun
+        assert trial.fit.free[capacity] == begun[-1]
+    assert right.calibration().optimum.fit.cost <= minimise(right.fit.problem, right.fit.unknowns()).fit.cost
 
 
 def test_an_effect_of_no_size_gains_nothing_over_a_fit_that_has_converged() -> None:

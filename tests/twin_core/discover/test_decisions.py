@@ -390,7 +390,12 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
     monkeypatch.setattr(trajectories, "_extensions", lambda *arguments, fallback: [(base, load("a"), 5)])
     monkeypatch.setattr(trajectories, "_near_extensions", lambda *arguments, fallback: [(base, load("b"), 5)])
     fitted = {"a": by_trajectory, "b": by_filter}
-    monkeypatch.setattr(trajectories, "_fitted", lambda state, seed, effect, n_tried: fitted[effect.where["node"]])
+
+    def tried(state: Search, seed: Trial, effect: Effect, n_tried: int, *, beside_heat: bool) -> Judged:
+        assert beside_heat == (effect.where["node"] == "b")
+        return fitted[str(effect.where["node"])]
+
+    monkeypatch.setattr(trajectories, "_fitted", tried)
     monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
     monkeypatch.setattr(trajectories, "accept", accepted)
     state = Search(base, base, n_named=5)
