@@ -273,17 +273,18 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
     return problem.with_network(problem.network.with_values(np.where(guessed, found, parameters.values)))
 
 
-def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = ()) -> Calibration:
+def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = (), afresh: bool = True) -> Calibration:
     """Return the open-loop calibration that starts from a fit in the presence of undeclared heat.
 
-    ``near`` are optima of the same problem found otherwise: the best of all is kept.
+    ``near`` are optima of the same problem found otherwise: the best of all is kept. Not ``afresh`` they are all there are.
 
     Raises
     ------
     ArithmeticError
         Where the heat balance has a solution from none of them.
     """
-    best = min([minimise(fit.problem, fit.unknowns()), *near], key=lambda o: o.fit.cost)
+    own = [minimise(fit.problem, fit.unknowns())] if afresh else []
+    best = min([*own, *near], key=lambda o: o.fit.cost)
     if not np.isfinite(best.fit.cost):
         raise ArithmeticError("the heat balance has no open-loop solution at the fitted parameters")
     return Calibration(fit.problem, best, fit_whitener(fit.problem, fit.problem.residuals(best.fit)), max_step_s)

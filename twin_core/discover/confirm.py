@@ -72,7 +72,9 @@ class Trial:
             simpler = self.simpler.calibration()
             start = carried_over(simpler.problem, simpler.optimum.unknowns, self.fit.problem, values)
             near.append(minimise(self.fit.problem, start))
-        return from_heat_fit(self.fit, self.max_step_s, near=near)
+        return from_heat_fit(
+            self.fit, self.max_step_s, near=near, afresh=not any(o.status == "converged" for o in near)
+        )
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:

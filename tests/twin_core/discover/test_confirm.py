@@ -107,7 +107,6 @@ def test_trajectories_are_fitted_from_where_the_undeclared_heat_left_the_paramet
         trial = confirm.try_on_trajectories(base, (effect,), lost, beside_heat=beside_heat)
         assert trial is not None and started == begun
         assert trial.fit.free[capacity] == begun[-1]
-    assert right.calibration().optimum.fit.cost <= minimise(right.fit.problem, right.fit.unknowns()).fit.cost
 
 
 def test_an_effect_of_no_size_gains_nothing_over_a_fit_that_has_converged() -> None:
