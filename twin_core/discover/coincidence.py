@@ -4,18 +4,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import BoolArray, FloatArray
 from twin_core.discover import policy
 from twin_core.discover.confirm import Trial
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
 
-N_BESIDE = 3
-"""Samples on either side of an instant that count as the same moment: a few tell it, whatever their number."""
+N_BESIDE = 6
+"""Samples on either side of an instant that count as the same moment: so closely have the onsets of the suites been found."""
 
 
 def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:
-    """Return a channel that changes where an event sets in, or ends, as it does nowhere else in the record; None if none does.
+    """Return a channel with a lone change where an event sets in, or ends; None if there is none.
 
     A law that nobody declared, of a heater that was switched once, say, shows when it is switched, and an event at that instant
     explains it as well. Where the channel changes like this at other times too, the event has had to tell itself from the law.
@@ -33,28 +33,34 @@ def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:
     spec = trial.fit.network.spec
     records = [segment.record for segment in trial.fit.problem.segments]
     for name in (name for name in spec.channels if name not in spec.sensors):
-        given = [record for record in records if name in record.values]
-        if any(_is_outstanding(given, name, instant_s) for instant_s in instants):
-            return name
+        for record, alone in zip(records, lone_changes(records, name), strict=True):
+            clock_s = record.clock_s
+            within = [t for t in instants if clock_s[0] <= t <= clock_s[-1]]
+            if alone[np.searchsorted(clock_s, within)].any():
+                return name
     return None
 
 
-def _is_outstanding(records: Sequence[Record], name: str, instant_s: float) -> bool:
-    """Return whether a channel changes about an instant more than anywhere else in some records, by far."""
-    here, elsewhere = 0.0, 0.0
-    for record in records:
-        change = _changes(record.values[name])
-        beyond = np.abs(np.arange(change.size) - (np.searchsorted(record.clock_s, instant_s) - N_BESIDE))
-        within = record.clock_s[0] <= instant_s <= record.clock_s[-1]
-        here = max(here, float(change[beyond <= N_BESIDE].max(initial=0.0)) if within else 0.0)
-        elsewhere = max(elsewhere, float(change[(beyond > 3 * N_BESIDE) | (not within)].max(initial=0.0)))
-    return here > policy.DOMINANCE * elsewhere
+def lone_changes(records: Sequence[Record], name: str) -> list[BoolArray]:
+    """Return where a channel changes more than anywhere else in all records, by far: (n_samples,) for each record."""
+    changes = [_changes(r.values[name]) if name in r.values else np.zeros(r.time_s.size) for r in records]
+    found = []
+    for own in changes:
+        others = max((float(c.max(initial=0.0)) for c in changes if c is not own), default=0.0)
+        apart = np.full(
+            2 * N_BESIDE + 1, others
+        )  # stretches that end before this one begins, or begin after it has ended
+        before = np.maximum.accumulate(np.concatenate([apart, own]))[: own.size]
+        after = np.maximum.accumulate(np.concatenate([apart, own[::-1]]))[: own.size][::-1]
+        found.append(np.maximum(before, after) < own / policy.LONE_CHANGE)
+    return found
 
 
 def _changes(values: FloatArray) -> FloatArray:
-    """Return by how much a channel changes over each stretch of samples that counts as one moment; gaps are held over."""
+    """Return by how much a channel changes over the stretch about each sample, (n_samples,); gaps are held over."""
     known = np.flatnonzero(np.isfinite(values))
     if known.size == 0:
-        return np.zeros(0)
-    held = values[known[np.maximum(np.searchsorted(known, np.arange(values.size), side="right") - 1, 0)]]
-    return np.abs(held[2 * N_BESIDE :] - held[: -2 * N_BESIDE])
+        return np.zeros(values.size)
+    at = np.arange(values.size)
+    held = values[known[np.maximum(np.searchsorted(known, at, side="right") - 1, 0)]]
+    return np.asarray(np.abs(held[np.minimum(at + N_BESIDE, at[-1])] - held[np.maximum(at - N_BESIDE, 0)]))

@@ -11,12 +11,12 @@ DOMINANCE = 2.0
 LEAST_COARSENESS = 1.5
 MOST_COARSENESS = 4.0
 VISIBLE_COARSENESS = 1.0
-WIDENED = 1.0
 FORESIGHT = 0.97
 BETWEEN_SESSIONS = 0.5
 REPEATABLE_SHARE = 0.1
 ALTERNATIVE_NATS = 3.0
 LARGEST_NOISE = 1.5
+LONE_CHANGE = 2.0
 UNEXPLAINED_SHARE = 1.0
 
 
@@ -58,8 +58,7 @@ THRESHOLDS: dict[str, Threshold] = {
     "DOMINANCE": Threshold(
         "ratio",
         "a name explains so many times what a lumped network may leave beside it, times so many times the share of variance that"
-        " it leaves of what it was not fitted to where that is below one; an input's change is like no other from so many times"
-        " the largest elsewhere",
+        " it leaves of what it was not fitted to where that is below one",
         "a name that explains less than what stays could be the same coarseness; twice tells them apart within a factor sqrt 2",
         0.0,
         1.0,
@@ -87,14 +86,6 @@ THRESHOLDS: dict[str, Threshold] = {
         "what stays from which a network is taken to be coarse, wholly so from twice as much",
         "one standard error: what stays is a mean over sensors of what exceeds their noise, which chance alone makes positive",
         1e-12,
-        0.5,
-        2.0,
-    ),
-    "WIDENED": Threshold(
-        NOISE_VARIANCE,
-        "what stays beside a finding from which pairs and trajectories are asked as well",
-        "a misfit as large as the noise",
-        0.0,
         0.5,
         2.0,
     ),
@@ -139,6 +130,14 @@ THRESHOLDS: dict[str, Threshold] = {
         1e12,
         1.25,
         2.0,
+    ),
+    "LONE_CHANGE": Threshold(
+        "ratio",
+        "an event is not named where an input's change is larger than so many times its largest change elsewhere",
+        "two settings of one input tell a law from an event where the smaller change is half of the larger one",
+        float("inf"),
+        4.0,
+        1.0,
     ),
     "UNEXPLAINED_SHARE": Threshold(
         "ratio of standard deviations",

@@ -56,6 +56,9 @@ REVISION_SHARE = 0.25
 """Share of the search's time that is left for looking over what was found: what has not been is no answer yet. A
 search without a deadline is not touched by it."""
 
+WIDENED = 1.0
+"""Variance that stays beside a finding, in units of the sensors' noise, from which pairs and trajectories are asked as well."""
+
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
 
@@ -141,7 +144,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
-    widened = not state.findings or mean_excess(state.trial) > policy.WIDENED
+    widened = not state.findings or mean_excess(state.trial) > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
     told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])

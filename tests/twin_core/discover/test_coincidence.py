@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from twin_core._typing import FloatArray
-from twin_core.discover.coincidence import N_BESIDE, coinciding_channel
+from twin_core.discover import policy
+from twin_core.discover.coincidence import N_BESIDE, coinciding_channel, lone_changes
 from twin_core.discover.confirm import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
 
 N, STEP_S = 400, 10.0
-TIME_S = STEP_S * np.arange(N)
 ONCE = np.where(np.arange(N) < 200, 9.0, 4.0)
 OFTEN = np.where(np.arange(N) // 50 % 2 == 0, 9.0, 4.0)
 
@@ -84,3 +84,38 @@ def test_neither_unit_nor_zero_of_a_channel_matters(scale: float, zero: float, s
     assert coinciding_channel(trial(scale * ONCE + zero), [step_at(sample)]) == coinciding_channel(
         trial(ONCE), [step_at(sample)]
     )
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 9), min_size=3, max_size=60), min_size=1, max_size=3),
+    st.sampled_from(["off", "half", "double", ""]),
+)
+def test_lone_changes_are_those_of_a_plain_count(columns: list[list[int]], variant: str) -> None:
+    """Stretch by stretch; off there are none."""
+    about = policy.THRESHOLDS["LONE_CHANGE"]
+    factor = getattr(about, variant) if variant else policy.LONE_CHANGE
+    records = [Record(np.arange(float(len(c))), {"P": np.array(c, dtype=float)}, None, "r") for c in columns]
+    changes = [
+        [abs(c[min(i + N_BESIDE, len(c) - 1)] - c[max(i - N_BESIDE, 0)]) for i in range(len(c))] for c in columns
+    ]
+    expected = [
+        [
+            factor
+            * max(
+                (
+                    value
+                    for k, other in enumerate(changes)
+                    for j, value in enumerate(other)
+                    if k != which or abs(i - j) > 2 * N_BESIDE
+                ),
+                default=0.0,
+            )
+            < own[i]
+            and factor < np.inf
+            for i in range(len(own))
+        ]
+        for which, own in enumerate(changes)
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(policy, "LONE_CHANGE", factor)
+        assert [found.tolist() for found in lone_changes(records, "P")] == expected

@@ -45,8 +45,8 @@ from twin_core.discover.policy import (
     REPEATABLE_SHARE,
     THRESHOLDS,
     VISIBLE_COARSENESS,
-    WIDENED,
 )
+from twin_core.discover.search import WIDENED
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
