@@ -22,9 +22,9 @@ from benchmarks.loop_cases import FIRST_SEED, GROUPS, N_CLEAN, N_NETWORKS, Task,
 from benchmarks.loop_table import save_tables
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.closed_loop import close_loop
-from twin_core.discover.confirm import Trial, try_effects, try_on_trajectories
 from twin_core.discover.screen import screen, survey_of
 from twin_core.discover.shortlist import refined
+from twin_core.discover.trial import Trial, try_effects, try_on_trajectories
 from twin_core.effects import REGISTRY
 from twin_core.holdout import predict, split_fraction
 

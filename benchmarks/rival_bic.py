@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.rival_residual import Regressed
 from twin_core.calibrate.second_order import to_model
-from twin_core.discover.confirm import Trial, try_on_trajectories
 from twin_core.discover.shortlist import best_of_each_place, screened
+from twin_core.discover.trial import Trial, try_on_trajectories
 
 N_REFITS = 6
 MAX_EFFECTS = 4

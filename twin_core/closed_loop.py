@@ -14,11 +14,11 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network, to_model
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
+from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction

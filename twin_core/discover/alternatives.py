@@ -15,17 +15,17 @@ from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance
-from twin_core.discover.confirm import (
+from twin_core.discover.evidence import weigh
+from twin_core.discover.judge import Finding, Judged, Search, once_each
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
+from twin_core.discover.trial import (
     Trial,
     about_trajectory,
     mean_excess,
     resettled,
     shared_unknowns,
     try_on_trajectories,
-    weigh,
 )
-from twin_core.discover.judge import Finding, Judged, Search, once_each
-from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
 from twin_core.effects.base import Effect, Place
 
 N_COMPARED = 8

@@ -4,7 +4,8 @@ import numpy as np
 
 from twin_core.calibrate.containment import attempted
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial, mean_excess, validate
+from twin_core.discover.evidence import validate
+from twin_core.discover.trial import Trial, mean_excess
 
 
 def by_chance(n_readings: int) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial
+from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record
 

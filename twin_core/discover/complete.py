@@ -4,10 +4,11 @@ from dataclasses import replace
 from functools import partial
 
 from twin_core.discover import policy
-from twin_core.discover.confirm import Trial, about_trajectory, resettled, try_on_trajectories, validate, weigh
+from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.judge import Judged, Search
 from twin_core.discover.screen import screen_sizes, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES
+from twin_core.discover.trial import Trial, about_trajectory, resettled, try_on_trajectories
 from twin_core.effects.base import Effect
 
 

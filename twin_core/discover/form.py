@@ -7,8 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from twin_core.discover.confirm import Trial, mean_excess, try_effects, weigh
+from twin_core.discover.evidence import weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
+from twin_core.discover.trial import Trial, mean_excess, try_effects
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.side_by_side import both, side_by_side
 

@@ -12,9 +12,10 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import by_chance, stands
 from twin_core.discover.coincidence import coinciding_channel
-from twin_core.discover.confirm import Evidence, Trial, Validation, mean_excess, validate
+from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
+from twin_core.discover.trial import Trial, mean_excess
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError

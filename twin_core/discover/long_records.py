@@ -8,7 +8,7 @@ import numpy as np
 from twin_core.calibrate.approach import coarse_problem
 from twin_core.calibrate.optimise import ADVICE, minimise
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
-from twin_core.discover.confirm import Trial, about_trajectory, carried_over, extended, fitted_effects
+from twin_core.discover.trial import Trial, about_trajectory, carried_over, extended, fitted_effects
 
 LONGEST = 4000
 """Samples that a search looks at; of a record of twice as many or more every k-th."""

@@ -9,13 +9,7 @@ import numpy as np
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import by_chance, least_explained, times_asked
-from twin_core.discover.confirm import (
-    Trial,
-    mean_excess,
-    try_effects,
-    validate,
-    weigh,
-)
+from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_MORE,
@@ -29,6 +23,7 @@ from twin_core.discover.judge import (
     foresight_of,
     worth,
 )
+from twin_core.discover.trial import Trial, mean_excess, try_effects
 from twin_core.effects.base import Effect
 from twin_core.side_by_side import side_by_side
 

@@ -14,7 +14,7 @@ from twin_core.calibrate.undeclared.model import gain_of_undeclared_heat
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
-from twin_core.discover.confirm import Evidence, Trial, converged, mean_excess, resettled, try_effects, weigh
+from twin_core.discover.evidence import Evidence, weigh
 from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -36,6 +36,7 @@ from twin_core.discover.trajectories import (
     TOGETHER_MISFIT_SHARE,
     extend_by_trajectory,
 )
+from twin_core.discover.trial import Trial, converged, mean_excess, resettled, try_effects
 from twin_core.effects.base import Effect, Place
 
 MAX_FINDINGS = 4

@@ -5,8 +5,8 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from twin_core.calibrate.undeclared.model import HeatFit
-from twin_core.discover.confirm import Trial
 from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
+from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Place, Survey
 

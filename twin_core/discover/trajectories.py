@@ -8,16 +8,11 @@ from collections.abc import Collection, Sequence
 from functools import partial
 from math import comb
 
-from twin_core.discover.confirm import (
-    Trial,
-    about_trajectory,
-    resettled,
-    try_on_trajectories,
-    weigh,
-)
+from twin_core.discover.evidence import weigh
 from twin_core.discover.judge import Judged, Search, accept, once_each, worth
 from twin_core.discover.screen import Probe
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
+from twin_core.discover.trial import Trial, about_trajectory, resettled, try_on_trajectories
 from twin_core.effects.base import Effect, Place
 
 N_REFITS, N_NEAR = 6, 9

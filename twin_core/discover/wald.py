@@ -11,7 +11,7 @@ from twin_core.calibrate.covariance import trajectory_covariance
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration
-from twin_core.discover.confirm import Trial, extended, shared_unknowns
+from twin_core.discover.trial import Trial, extended, shared_unknowns
 from twin_core.effects.base import Effect
 
 LESS = 0.1

@@ -19,8 +19,8 @@ from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.covariance import gls_covariance
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener
-from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Finding
+from twin_core.discover.trial import Trial
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 from twin_core.units import to_si

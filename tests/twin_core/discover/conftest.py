@@ -6,7 +6,8 @@ import pytest
 
 from twin_core import side_by_side
 from twin_core.discover import coarseness, revision
-from twin_core.discover.confirm import Trial, Validation
+from twin_core.discover.evidence import Validation
+from twin_core.discover.trial import Trial
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.evidence import Evidence, Validation
 from twin_core.discover.judge import (
     Judged,
 )
@@ -14,6 +14,7 @@ from twin_core.discover.policy import (
     MOST_COARSENESS,
     VISIBLE_COARSENESS,
 )
+from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 

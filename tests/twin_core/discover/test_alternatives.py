@@ -7,9 +7,10 @@ import pytest
 from tests.twin_core.discover.stubs import CHANCE, JUST, NEEDED, judged, load, stub
 from twin_core.discover import alternatives
 from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.confirm import Evidence, Trial
+from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Search
 from twin_core.discover.policy import REPEATABLE_SHARE
+from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
 
 BEFORE, LEFT = 10.0, 2.0

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from twin_core._typing import FloatArray
 from twin_core.discover import policy
 from twin_core.discover.coincidence import N_BESIDE, coinciding_channel, lone_changes
-from twin_core.discover.confirm import Trial
+from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 from twin_core.telemetry import Record

@@ -14,9 +14,9 @@ from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Fit
 from twin_core.calibrate.second_order import fit_network, from_heat_fit
 from twin_core.closed_loop import close_loop
-from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.judge import Search
 from twin_core.discover.search import REVISION_SHARE, search
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
 from twin_core.report.phrasing import headline
@@ -99,9 +99,7 @@ def test_everything_may_fail(base: Trial, monkeypatch: pytest.MonkeyPatch) -> No
 
 
 @pytest.mark.usefixtures("few_kinds")
-@pytest.mark.parametrize(
-    "path", ["twin_core.discover.search.resettled", "twin_core.discover.confirm.Trial.misfit_share"]
-)
+@pytest.mark.parametrize("path", ["twin_core.discover.search.resettled", "twin_core.discover.trial.Trial.misfit_share"])
 def test_what_settles_or_scales_a_finding_fails_alone(base: Trial, monkeypatch: pytest.MonkeyPatch, path: str) -> None:
     """Neither is a candidate's own fit: what was found before it stands, and the failure is listed."""
     monkeypatch.setattr(path, failing(lambda *a, **k: None, 1, 1))

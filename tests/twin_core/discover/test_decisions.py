@@ -14,7 +14,7 @@ from tests.twin_core.discover.stubs import CHANCE, JUST, LEAST, MOST, NEEDED, Pr
 from twin_core.discover import coarseness, judge, policy, trajectories
 from twin_core.discover import search as searching
 from twin_core.discover.coarseness import least_explained, stands
-from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.evidence import Evidence, Validation
 from twin_core.discover.form import Repeatable
 from twin_core.discover.judge import (
     COINCIDES,
@@ -47,6 +47,7 @@ from twin_core.discover.policy import (
     VISIBLE_COARSENESS,
 )
 from twin_core.discover.search import WIDENED
+from twin_core.discover.trial import Trial
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect

@@ -16,8 +16,8 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
 from twin_core.closed_loop import corrected
 from twin_core.discover import shortlist
-from twin_core.discover.confirm import Trial
 from twin_core.discover.search import search
+from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
 from twin_core.gp.kernels import Matern

@@ -7,11 +7,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover.confirm import Evidence, Trial, try_effects, weigh
+from twin_core.discover.evidence import Evidence, weigh
 from twin_core.discover.form import Repeatable, acts_at, against_free_forms, more_is_left_elsewhere, repeatable_heat
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
 from twin_core.discover.revision import prune
 from twin_core.discover.screen import screen, survey_of
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.proportional_heater import ProportionalHeater

@@ -7,8 +7,8 @@ from benchmarks.network_cases import network_case
 from twin_core.calibrate.second_order import fit_network
 from twin_core.closed_loop import close_loop
 from twin_core.discover import long_records
-from twin_core.discover.confirm import Trial
 from twin_core.discover.long_records import on_all_samples, searched
+from twin_core.discover.trial import Trial
 
 
 def test_a_long_record_is_searched_on_some_samples_and_calibrated_on_all(monkeypatch: pytest.MonkeyPatch) -> None:

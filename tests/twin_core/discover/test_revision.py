@@ -18,7 +18,7 @@ from tests.twin_core.discover.stubs import (
 )
 from twin_core.discover import policy, revision
 from twin_core.discover.coarseness import stands
-from twin_core.discover.confirm import Evidence, Trial, Validation
+from twin_core.discover.evidence import Evidence, Validation
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_LAW,
@@ -43,6 +43,7 @@ from twin_core.discover.revision import (
     tell_alternatives,
     withdraw,
 )
+from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
 

@@ -8,7 +8,7 @@ from scipy.optimize import curve_fit
 from twin_core._typing import FloatArray
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover import wald
-from twin_core.discover.confirm import Trial, try_effects
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect

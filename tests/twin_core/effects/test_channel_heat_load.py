@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network, to_model
-from twin_core.discover.confirm import Trial, try_effects
 from twin_core.discover.screen import survey_of
 from twin_core.discover.shortlist import refined
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.model import build_network

@@ -6,8 +6,8 @@ from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
-from twin_core.discover.confirm import Trial
 from twin_core.discover.judge import Search
+from twin_core.discover.trial import Trial
 from twin_core.errors import ModelError
 from twin_core.missing_heat import smoothed as module
 from twin_core.missing_heat.smoothed import NodeHeat, added_to_report, smooth_missing_heat

@@ -6,9 +6,10 @@ from scipy.integrate import quad, solve_ivp
 from scipy.stats import norm
 
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover.confirm import Evidence, Trial, try_effects
+from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Judged
 from twin_core.discover.screen import screen, survey_of
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.network.spec import TwinSpec

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from twin_core.discover.confirm import Evidence
+from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.effects import effect_from_json
 from twin_core.effects.base import Effect

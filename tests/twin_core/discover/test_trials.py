@@ -1,4 +1,4 @@
-"""Confirmation: errors on left-out blocks against true refits, and what evidence pays for."""
+"""Trials and their evidence: errors on left-out blocks against true refits, and what evidence pays for."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -17,10 +17,12 @@ from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
-from twin_core.discover import confirm
-from twin_core.discover.confirm import Trial, converged, try_effects, validate, weigh
+from twin_core.discover import evidence as evidence_module
+from twin_core.discover import trial as trial_module
+from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.left_out import N_BLOCKS, blocked_errors
 from twin_core.discover.policy import FORESIGHT
+from twin_core.discover.trial import Trial, converged, try_effects
 from twin_core.effects import REGISTRY
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
@@ -58,7 +60,7 @@ def test_an_effect_that_starts_far_too_large_ends_no_less_likely_than_none(monke
     base = declared(0.0)
     vast = REGISTRY["radiative_exchange"]({"nodes": ("n0", "n1")}, {"R_m2": 10.0})
     assert try_effects(base, [vast]).fit.log_posterior > base.fit.log_posterior - 3.0
-    monkeypatch.setattr(confirm, "START_LOSS_NATS", np.inf)
+    monkeypatch.setattr(trial_module, "START_LOSS_NATS", np.inf)
     assert try_effects(base, [vast]).fit.log_posterior < base.fit.log_posterior - 30.0
 
 
@@ -79,7 +81,7 @@ def test_an_effect_that_leaves_no_heat_balance_where_it_starts_starts_smaller() 
     )
     base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
     chill = REGISTRY["constant_heat_load"]({"node": "n0"}, {"Q_W": -1e4})
-    trial = confirm.try_on_trajectories(base, (chill,))
+    trial = trial_module.try_on_trajectories(base, (chill,))
     assert trial is not None
     assert trial.effects[0].values["Q_W"] == pytest.approx(level_W, rel=0.02)
 
@@ -100,11 +102,11 @@ def test_trajectories_are_fitted_from_where_the_undeclared_heat_left_the_paramet
         started.append(float(unknowns[problem.network.parameters.free_names.index("C:n0")]))
         return minimise(problem, unknowns, max_iterations=0)
 
-    monkeypatch.setattr(confirm, "minimise", caught)
+    monkeypatch.setattr(trial_module, "minimise", caught)
     effect = right.effects[0]
     for beside_heat, begun in ((False, [astray[capacity]]), (True, [astray[capacity], base.fit.free[capacity]])):
         started.clear()
-        trial = confirm.try_on_trajectories(base, (effect,), lost, beside_heat=beside_heat)
+        trial = trial_module.try_on_trajectories(base, (effect,), lost, beside_heat=beside_heat)
         assert trial is not None and started == begun
         assert trial.fit.free[capacity] == begun[-1]
 
@@ -236,7 +238,7 @@ def test_an_instant_is_paid_for_as_one_among_all_samples() -> None:
         step = REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 1.0, "time": 0.4}, clock)
         simple, rich = stub(n_free=3), stub(step, n_free=5)
         simple, rich = replace(simple, n_samples=n), replace(rich, n_samples=n)
-        excess.append(confirm._evidence(float(gains.max()), simple, rich, 1).log_bayes_factor - exact)
+        excess.append(evidence_module._evidence(float(gains.max()), simple, rich, 1).log_bayes_factor - exact)
     assert np.ptp(excess) < 1.5 and np.abs(excess).max() < 3.0
 
 
