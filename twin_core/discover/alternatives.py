@@ -14,13 +14,13 @@ import numpy as np
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
-from twin_core.discover.coarseness import by_chance
 from twin_core.discover.evidence import weigh
 from twin_core.discover.judge import Finding, Judged, Search, once_each
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
 from twin_core.discover.trial import (
     Trial,
     about_trajectory,
+    by_chance,
     mean_excess,
     resettled,
     shared_unknowns,
@@ -50,7 +50,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     own = finding.effects[0]
     if len(finding.effects) != 1 or own.fallback or left <= by_chance(state.trial.n_samples):
         return finding
-    least = (1.0 - policy.REPEATABLE_SHARE) * (mean_excess(simple) - left)
+    least = (1.0 - policy.REPEATABLE_SHARE) * (simple.unexplained() - state.trial.unexplained())
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
     starts = [simple.calibration()]
     bare = state.attempt(
@@ -69,7 +69,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         [(partial(_explaining, simple, start, effect, least), in_place(effect)) for start, effect in options]
     )
     best: dict[Place, Trial] = {}
-    for trial in sorted((trial for trial in fitted if trial is not None), key=mean_excess):
+    for trial in sorted((trial for trial in fitted if trial is not None), key=Trial.unexplained):
         best.setdefault(trial.effects[-1].place, trial)
     told = state.attempt_each(
         [(partial(_supported, state, simple, t, needed), in_place(t.effects[-1])) for t in best.values()]
@@ -109,7 +109,7 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
 def _explaining(simple: Trial, start: Calibration, effect: Effect, least: float) -> Trial | None:
     """Return an effect on top of a trial, fitted on trajectories, if it explains at least so much of the misfit."""
     trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
-    return None if trial is None or mean_excess(simple) - mean_excess(trial) < least else trial
+    return None if trial is None or simple.unexplained() - trial.unexplained() < least else trial
 
 
 def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:

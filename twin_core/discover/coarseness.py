@@ -5,12 +5,7 @@ import numpy as np
 from twin_core.calibrate.containment import attempted
 from twin_core.discover import policy
 from twin_core.discover.evidence import validate
-from twin_core.discover.trial import Trial, mean_excess
-
-
-def by_chance(n_readings: int) -> float:
-    """Return the variance, in units of the sensors' noise, up to which what stays of so many readings is chance."""
-    return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
+from twin_core.discover.trial import Trial, by_chance, mean_excess
 
 
 def least_explained(beside: float, left: float, n_readings: int, *, is_named: bool = True) -> float:
@@ -50,7 +45,7 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
     is_named
         Whether names were added: a heat without a name has no less to explain.
     """
-    explained = mean_excess(simple) - mean_excess(rich)
+    explained = simple.unexplained() - rich.unexplained()
     alone = is_named and not simple.effects
     told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
     if told is not None:
@@ -61,4 +56,4 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
 def stands(simple: Trial, rich: Trial) -> bool:
     """Return whether what was added explains so much more than what stays beside it that it would not be withdrawn."""
     left, n_readings = mean_excess(rich), rich.n_samples
-    return left <= by_chance(n_readings) or times_asked(simple, rich, least_explained(left, left, n_readings)) >= 1.0
+    return left <= by_chance(n_readings) or times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings)) >= 1.0

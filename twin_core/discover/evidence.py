@@ -91,7 +91,7 @@ def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> E
 
 def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
     """Return what the readings say for the rich trial where all that nobody declared wanders at the sensors, not at the nodes."""
-    gain = rich.calibration().log_posterior - simple.calibration().log_posterior
+    gain = rich.along_trajectories() - simple.along_trajectories()
     return replace(_evidence(gain, simple, rich, n_tried), along_trajectories=True)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from twin_core.discover.evidence import weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
-from twin_core.discover.trial import Trial, mean_excess, try_effects
+from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.side_by_side import both, side_by_side
 
@@ -91,14 +91,14 @@ def against_free_forms(
 def _repeatable(trial: Trial, options: Sequence[Trial], n_tried: int) -> Repeatable:
     """Return what the likeliest of some trials with a free form on top removes."""
     for top in _likeliest(trial, options):
-        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, mean_excess(trial) - mean_excess(top))
+        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, trial.unexplained() - top.unexplained())
     return Repeatable()
 
 
 def _removed_more(simple: Trial, trial: Trial, rivals: Sequence[Trial], most: float) -> float | None:
     """Return what the likeliest rival of a trial removes more than it, if it is far likelier."""
     likelier = [r for r in _likeliest(simple, rivals) if weigh(r, trial, 1).log_bayes_factor < -most]
-    return max((mean_excess(trial) - mean_excess(rival) for rival in likelier), default=None)
+    return max((trial.unexplained() - rival.unexplained() for rival in likelier), default=None)
 
 
 def more_is_left_elsewhere(

@@ -10,12 +10,12 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
-from twin_core.discover.coarseness import by_chance, stands
+from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import coinciding_channel
 from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
-from twin_core.discover.trial import Trial, mean_excess
+from twin_core.discover.trial import Trial, by_chance
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
@@ -222,11 +222,11 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
             if sum(j.validation is not None for j in refused) + len(passed) >= N_VALIDATED:
                 break
             if unlike:
-                left = state.attempt(partial(mean_excess, best.trial), best.labels)
+                left = state.attempt(best.trial.unexplained, best.labels)
                 if left is None:
                     refused.append(replace(best, reason=NOT_EXAMINED))
                 more_than_chance = by_chance(best.trial.n_samples)
-                if left is None or any(left + more_than_chance >= mean_excess(trial) for trial in unlike):
+                if left is None or any(left + more_than_chance >= trial.unexplained() for trial in unlike):
                     continue  # what explains no more is no better a name for this heat
             own, resembles = examined(i)
             if own.reason:
@@ -317,9 +317,9 @@ def _little(simple: Trial, trial: Trial, removed: float) -> float:
     That is a share of what the name removes, and no more than a coarse network may leave, or than as large a share of what stays
     beside either: where a model misses so much else, a law is not told wrong by less.
     """
-    stays = mean_excess(trial) - removed
+    stays = trial.unexplained() - removed
     share = policy.REPEATABLE_SHARE
-    return min(share * (mean_excess(simple) - mean_excess(trial)), max(policy.MOST_COARSENESS, share * stays))
+    return min(share * (simple.unexplained() - trial.unexplained()), max(policy.MOST_COARSENESS, share * stays))
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

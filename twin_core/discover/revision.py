@@ -8,7 +8,7 @@ import numpy as np
 
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.coarseness import by_chance, least_explained, times_asked
+from twin_core.discover.coarseness import least_explained, times_asked
 from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
@@ -23,7 +23,7 @@ from twin_core.discover.judge import (
     foresight_of,
     worth,
 )
-from twin_core.discover.trial import Trial, mean_excess, try_effects
+from twin_core.discover.trial import Trial, by_chance, mean_excess, try_effects
 from twin_core.effects.base import Effect
 from twin_core.side_by_side import side_by_side
 
@@ -50,7 +50,7 @@ def withdraw(state: Search, needed: float) -> None:
         for finding in state.findings:
             places = finding.judged.places
             asked |= {frozenset([place]): least_explained(0.0, left, n_readings) for place in places}
-            asked[places] = least_explained(left, left, n_readings, is_named=places in named)
+            asked[places] = least_explained(state.trial.unexplained(), left, n_readings, is_named=places in named)
         without = _without_each(state, asked)
         told = {
             places: times_asked(kept[0], state.trial, asked[places], is_named=places in named)
@@ -184,11 +184,11 @@ def _explains_as_much(simple: Trial, named: Trial, heat: Trial) -> bool:
 
     What stays beside the heat is then visible and no more than coarseness, which leans towards whatever has more freedom.
     """
-    left = mean_excess(heat)
-    if not by_chance(heat.n_samples) < left <= policy.MOST_COARSENESS:
+    left = heat.unexplained()
+    if mean_excess(heat) <= by_chance(heat.n_samples) or left > policy.MOST_COARSENESS:
         return False
-    without = mean_excess(simple)
-    return without - mean_excess(named) >= (1.0 - policy.REPEATABLE_SHARE) * (without - left)
+    without = simple.unexplained()
+    return without - named.unexplained() >= (1.0 - policy.REPEATABLE_SHARE) * (without - left)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:
@@ -230,9 +230,9 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
     if finding.judged in simplest:
         likelier = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed]
         better = [(j, needed, np.inf) for j in sorted(likelier, key=worth)]
-        asked = ((j, state.attempt(partial(mean_excess, j.trial), j.labels)) for j in simplest)
+        asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in simplest)
         left = [(value, j) for j, value in asked if value is not None]
-        less = [(value, j) for value, j in left if j is not finding.judged and value < mean_excess(state.trial)]
+        less = [(value, j) for value, j in left if j is not finding.judged and value < state.trial.unexplained()]
         better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
     for best, margin, foresight in better:
         replaced = partial(_in_place_of, state, finding, best, needed, margin, foresight)

@@ -36,7 +36,7 @@ from twin_core.discover.trajectories import (
     TOGETHER_MISFIT_SHARE,
     extend_by_trajectory,
 )
-from twin_core.discover.trial import Trial, converged, mean_excess, resettled, try_effects
+from twin_core.discover.trial import Trial, converged, resettled, try_effects
 from twin_core.effects.base import Effect, Place
 
 MAX_FINDINGS = 4
@@ -145,7 +145,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     if missing is not None and missing <= needed:
         return False
     what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
-    widened = not state.findings or mean_excess(state.trial) > WIDENED
+    widened = not state.findings or state.trial.unexplained() > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
     told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
@@ -153,7 +153,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     if not (told or fallback or state.findings):
         told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial
-    if not widened or (told and mean_excess(after) <= policy.MOST_COARSENESS and stands(state.trial, after)):
+    if not widened or (told and after.unexplained() <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
         return told
 

@@ -7,6 +7,8 @@ from functools import partial
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.gradients import WithGradients, with_gradients
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.second_order import Calibration, from_heat_fit, sampling_step_s
@@ -20,7 +22,7 @@ from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
 from twin_core.side_by_side import side_by_side
 
-LN_2 = float(np.log(2.0))
+LN_2, LN_3 = np.log([2.0, 3.0]).tolist()
 
 START_LOSS_NATS = 30.0
 """Loss of likelihood at the start of a fit above which a second one starts from less of the effect; the fit that ends likelier
@@ -94,19 +96,38 @@ class Trial:
         return float(np.sqrt(np.mean([(m.sigma_ou / n) ** 2 for m, n in zip(models, noise, strict=True)])))
 
     @once
+    def beside_gradients(self) -> WithGradients | None:
+        """Trajectories fitted beside temperature gradients within the nodes, which no lumped network describes.
+
+        None where trajectories leave no more than chance, so that gradients have nothing to explain, and where their
+        arithmetic fails.
+        """
+        calibration = self.calibration()
+        if self.excess().mean() <= by_chance(self.n_samples):
+            return None
+        return attempted(partial(with_gradients, calibration.problem, calibration.optimum), "gradients within nodes", [])
+
+    @once
+    def along_trajectories(self) -> float:
+        """ln of what the readings say where no undeclared heat acts: a misfit wanders at the sensors, beside gradients or not."""
+        gradients = self.beside_gradients()
+        beside = -np.inf if gradients is None else gradients.log_posterior
+        return float(np.logaddexp(self.calibration().log_posterior, beside)) - LN_2
+
+    @once
     def log_evidence(self) -> float:
         """ln of what the readings say for the model, its priors included, in nats.
 
-        What no parameter follows is either heat that wanders at the nodes, or a misfit that wanders at the sensors because a
-        lumped network is coarser than what it describes. Nobody knows beforehand: the mean over both counts, in which the
-        likelier one leads (Hoeting et al. 1999, Bayesian model averaging).
+        What no parameter follows is heat that wanders at the nodes, a misfit that wanders at the sensors, or such a misfit beside
+        gradients within the nodes, because a lumped network is coarser than what it describes. Nobody knows beforehand: the mean
+        over all three counts, in which the likeliest one leads (Hoeting et al. 1999, Bayesian model averaging).
         """
-        return float(np.logaddexp(self.fit.log_posterior, self.calibration().log_posterior)) - LN_2
+        return float(np.logaddexp(self.fit.log_posterior, self.along_trajectories() + LN_2)) - LN_3
 
     @property
     def least_evidence(self) -> float:
         """What :attr:`log_evidence` is at least, from wandering heat alone: open-loop trajectories need not be computed."""
-        return self.fit.log_posterior - LN_2
+        return self.fit.log_posterior - LN_3
 
     @once
     def excess(self) -> FloatArray:
@@ -114,12 +135,21 @@ class Trial:
 
         Noise is what one sample does not tell of the next; more than ``LARGEST_NOISE`` of what calibration took for it is misfit.
         """
+        return self._excess(self.calibration().residuals)
+
+    def _excess(self, residuals: Sequence[FloatArray]) -> FloatArray:
         calibration = self.calibration()
         interval_s = sampling_step_s([segment.record for segment in calibration.problem.segments])
         own = np.array([model.unforeseen(interval_s) for model in calibration.whitener.models])
         noise = np.maximum(np.minimum(own, policy.LARGEST_NOISE * calibration.problem.noise_K), 1e-300)
-        square = np.nanmean((np.concatenate(calibration.residuals) / noise) ** 2, axis=0)
+        square = np.nanmean((np.concatenate(residuals) / noise) ** 2, axis=0)
         return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
+
+    @once
+    def unexplained(self) -> float:
+        """The same beside gradients within the nodes where these explain some of it, mean over sensors."""
+        gradients, plain = self.beside_gradients(), float(np.mean(self.excess()))
+        return plain if gradients is None else min(plain, float(np.mean(self._excess(gradients.residuals))))
 
     @property
     def n_samples(self) -> int:
@@ -151,6 +181,11 @@ def carried_over(simpler: Problem, at: FloatArray, problem: Problem, effect_valu
     for i in range(len(problem.segments)):
         unknowns[problem.start_columns(i)] = at[simpler.start_columns(i)][source]
     return unknowns
+
+
+def by_chance(n_readings: int) -> float:
+    """Return the variance, in units of the sensors' noise, up to which what stays of so many readings is chance."""
+    return policy.VISIBLE_COARSENESS * float(np.sqrt(2.0 / n_readings))
 
 
 def mean_excess(trial: Trial) -> float:
