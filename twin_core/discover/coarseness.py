@@ -56,4 +56,6 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
 def stands(simple: Trial, rich: Trial) -> bool:
     """Return whether what was added explains so much more than what stays beside it that it would not be withdrawn."""
     left, n_readings = mean_excess(rich), rich.n_samples
-    return left <= by_chance(n_readings) or times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings)) >= 1.0
+    if left <= by_chance(n_readings):
+        return True
+    return times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings)) >= 1.0

@@ -21,6 +21,7 @@ from twin_core.discover.judge import (
     Without,
     examine,
     foresight_of,
+    is_close,
     worth,
 )
 from twin_core.discover.trial import Trial, by_chance, mean_excess, try_effects
@@ -218,22 +219,18 @@ def tell_alternatives(state: Search, needed: float) -> None:
 def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
     """Exchange a finding for the best of its alternatives that passes, if it is simpler, far likelier, or predicts better.
 
-    Alternatives explain as much where a coarse network makes nats say little, so that the simplest leads (and the likeliest of
-    these): what has more freedom fits the coarseness too. The first look ranks by linear responses, and what it left out may
+    A simpler one leads that the readings hardly tell from it. The first look ranks by linear responses, and what it left out may
     turn out to explain more: likelier by the odds asked for, or leaving less and predicting better what it was not fitted to.
     The finding is an alternative then.
     """
     finding = state.findings[position]
-    options = (finding.judged, *finding.alternatives)
-    simplest = [j for j in options if _freedom(j) == min(map(_freedom, options))]
-    better = [(j, -np.inf, np.inf) for j in sorted(simplest, key=worth)]
-    if finding.judged in simplest:
-        likelier = [j for j in finding.alternatives if worth(j) < worth(finding.judged) - needed]
-        better = [(j, needed, np.inf) for j in sorted(likelier, key=worth)]
-        asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in simplest)
-        left = [(value, j) for j, value in asked if value is not None]
-        less = [(value, j) for value, j in left if j is not finding.judged and value < state.trial.unexplained()]
-        better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
+    own = finding.judged
+    ranked = sorted(finding.alternatives, key=worth)
+    better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in ranked if _freedom(j) < _freedom(own) and is_close(j, own)]
+    better += [(j, needed, np.inf) for j in ranked if worth(j) < worth(own) - needed]
+    asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in ranked)
+    less = [(value, j) for j, value in asked if value is not None and value < state.trial.unexplained()]
+    better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
     for best, margin, foresight in better:
         replaced = partial(_in_place_of, state, finding, best, needed, margin, foresight)
         if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
