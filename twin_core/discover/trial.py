@@ -105,7 +105,9 @@ class Trial:
         calibration = self.calibration()
         if self.excess().mean() <= by_chance(self.n_samples):
             return None
-        return attempted(partial(with_gradients, calibration.problem, calibration.optimum), "gradients within nodes", [])
+        return attempted(
+            partial(with_gradients, calibration.problem, calibration.optimum), "gradients within nodes", []
+        )
 
     @once
     def along_trajectories(self) -> float:
@@ -147,9 +149,11 @@ class Trial:
 
     @once
     def unexplained(self) -> float:
-        """The same beside gradients within the nodes where these explain some of it, mean over sensors."""
-        gradients, plain = self.beside_gradients(), float(np.mean(self.excess()))
-        return plain if gradients is None else min(plain, float(np.mean(self._excess(gradients.residuals))))
+        """The same, mean over sensors, beside gradients within the nodes where the readings are likelier with them."""
+        gradients = self.beside_gradients()
+        if gradients is None or gradients.log_posterior <= self.calibration().log_posterior:
+            return mean_excess(self)
+        return float(np.mean(self._excess(gradients.residuals)))
 
     @property
     def n_samples(self) -> int:

@@ -1,0 +1,128 @@
+"""Gradients within nodes: sensors off the mean of their node, against dense marginal likelihoods and a body that has them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from tests.analytic import laplacian, linear_states
+from tests.helpers import conductive_spec, record_of
+from twin_core._typing import FloatArray
+from twin_core.calibrate.gradients import BIOT, heat_flows_K, with_gradients
+from twin_core.calibrate.second_order import Calibration, fit_network
+from twin_core.network.spec_io import load_spec
+from twin_core.telemetry import Record
+
+NOISE_K = 0.05
+CAPACITY_J_PER_K = np.array([4.0e3, 7.0e3])
+G_W_PER_K, LEAK_W_PER_K, ROOM_K = 2.5, 1.5, 280.0
+OFF = np.array([0.08, -0.1, 0.12, 0.06])
+"""b_l of the conductor and the load at n0, of the conductor and the leak at n1."""
+
+
+def spec() -> dict[str, Any]:
+    data = conductive_spec(
+        2,
+        [(0, 1)],
+        channels={"Q": {"kind": "power", "unit": "W"}},
+        loads=[{"channel": "Q", "node": "n0"}],
+        boundaries={"room": {"value_K": ROOM_K}},
+    )
+    data["conductors"].append({"between": ["n1", "room"], "conductance_W_per_K": {"guess": 1.0}})
+    for sensor in ("T0", "T1"):
+        data["channels"][sensor]["noise_std"] = NOISE_K
+    return data
+
+
+def off_the_mean_K(states_K: FloatArray, power_W: FloatArray) -> FloatArray:
+    """Return what the sensors read beside the mean of their node, (n_times, 2)."""
+    through, lost = G_W_PER_K * (states_K[:, 1] - states_K[:, 0]), LEAK_W_PER_K * (ROOM_K - states_K[:, 1])
+    first = (OFF[0] * through + OFF[1] * power_W) / G_W_PER_K
+    second = (OFF[2] * -through + OFF[3] * lost) / (G_W_PER_K + LEAK_W_PER_K)
+    return np.stack([first, second], axis=1)
+
+
+def record(share: float) -> Record:
+    """Return readings of which a share of the gradients is seen; the heat of a step is seen at its end."""
+    rng = np.random.default_rng(3)
+    time_s, power = 60.0 * np.arange(400), np.repeat(rng.choice([0.0, 40.0, 90.0], 40), 10)
+    rates = -(laplacian(2, [(0, 1)], [G_W_PER_K]) + np.diag([0.0, LEAK_W_PER_K])) / CAPACITY_J_PER_K[:, None]
+    drive = np.stack([power, np.full(400, LEAK_W_PER_K * ROOM_K)], axis=1) / CAPACITY_J_PER_K
+    states = linear_states(rates, drive, np.array([290.0, 288.0]), time_s)
+    seen = np.concatenate([power[:1], power[:-1]])
+    read = states + share * off_the_mean_K(states, seen) + rng.normal(0.0, NOISE_K, (400, 2))
+    return record_of(time_s, Q=power, T0=read[:, 0], T1=read[:, 1])
+
+
+def fitted(share: float) -> Calibration:
+    return fit_network(load_spec(spec()), [record(share)])[1]
+
+
+def test_a_body_with_gradients_is_fitted_to_the_noise() -> None:
+    """Along one temperature per node no parameters follow it; the readings say so by hundreds of nats."""
+    calibration = fitted(1.0)
+    plain = np.concatenate(calibration.residuals).std(axis=0)
+    found = with_gradients(calibration.problem, calibration.optimum)
+    left = np.concatenate(found.residuals).std(axis=0)
+    assert (plain > 1.5 * NOISE_K).all()
+    assert left == pytest.approx(NOISE_K, rel=0.1)
+    assert found.log_posterior > calibration.log_posterior + 100.0
+
+
+def test_where_there_are_none_they_cost_more_than_they_gain() -> None:
+    calibration = fitted(0.0)
+    found = with_gradients(calibration.problem, calibration.optimum)
+    assert found.log_posterior < calibration.log_posterior
+
+
+def test_evidence_is_averaged_over_all_gradients() -> None:
+    """The oracle is the dense marginal likelihood of what the mean temperatures leave, gradients in its covariance."""
+    calibration = fitted(0.3)
+    problem = calibration.problem
+    found = with_gradients(problem, calibration.optimum)
+    dense = formula = 0.0
+    for sensor, flows in enumerate(heat_flows_K(problem, calibration.optimum)):
+        noise, left = found.whitener.models[sensor], found.residuals[0][:, sensor]
+        assert noise.sigma_ou == 0.0
+        covariance = noise.sigma_white**2 * np.eye(left.size) + BIOT**2 * flows @ flows.T
+        dense += multivariate_normal.logpdf(left + flows @ found.biot[sensor], cov=covariance)
+    priors = found.log_posterior - dense
+    mean, std = problem.prior()
+    formula = -0.5 * (problem.n_unknowns - problem.n_free) * np.log(problem.n_samples)
+    least = formula - 0.5 * float((((calibration.optimum.unknowns - mean) / std) ** 2).sum())
+    assert priors == pytest.approx(least, abs=1.0)
+
+
+def test_flows_are_those_of_the_heat_balance() -> None:
+    """In a steady state the flows into a node add up to nothing, and each is what its link carries."""
+    time_s, power_W = 600.0 * np.arange(100), 30.0
+    hot_K = ROOM_K + power_W / LEAK_W_PER_K
+    data = spec()
+    data["conductors"][0]["conductance_W_per_K"] = {"value": G_W_PER_K}
+    data["conductors"][1]["conductance_W_per_K"] = {"value": LEAK_W_PER_K}
+    noise = np.random.default_rng(0).normal(0.0, NOISE_K, (100, 2))
+    steady = record_of(
+        time_s, Q=power_W, T0=hot_K + power_W / G_W_PER_K + noise[:, 0], T1=np.full(100, hot_K) + noise[:, 1]
+    )
+    calibration = fit_network(load_spec(data), [steady])[1]
+    first, second = heat_flows_K(calibration.problem, calibration.optimum)
+    assert first[-1] * G_W_PER_K == pytest.approx([-power_W, power_W], rel=1e-3)
+    assert second[-1] * (G_W_PER_K + LEAK_W_PER_K) == pytest.approx([power_W, -power_W], rel=1e-3)
+
+
+def test_a_node_that_gives_its_heat_to_nothing_has_no_gradients() -> None:
+    """Without a conductance there is no Biot number."""
+    data = {
+        "twin": "block",
+        "channels": {"T": {"kind": "temperature", "unit": "K"}, "Q": {"kind": "power", "unit": "W"}},
+        "nodes": [{"id": "block", "sensor": "T", "capacity_J_per_K": {"guess": 1e3}}],
+        "loads": [{"channel": "Q", "node": "block"}],
+    }
+    rng, time_s = np.random.default_rng(1), 60.0 * np.arange(60)
+    power = rng.choice([0.0, 5.0], 60)
+    read = 290.0 + np.concatenate([[0.0], np.cumsum(power)[:-1]]) * 60.0 / 2e3 + rng.normal(0.0, NOISE_K, 60)
+    calibration = fit_network(load_spec(data), [record_of(time_s, Q=power, T=read)])[1]
+    found = with_gradients(calibration.problem, calibration.optimum)
+    assert found.biot[0].size == 0
+    assert found.log_posterior == pytest.approx(calibration.log_posterior, abs=0.1)
