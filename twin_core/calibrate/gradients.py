@@ -39,6 +39,8 @@ class WithGradients:
 
     Attributes
     ----------
+    unknowns : (n_unknowns,)
+        Of the problem, where the fit ended.
     residuals : one (n_samples, n_sensors) per segment
         Measured minus modelled in K, NaN where missing.
     biot : one (n_flows,) per sensor
@@ -49,6 +51,7 @@ class WithGradients:
         As ``Calibration.log_posterior``, averaged over the gradients.
     """
 
+    unknowns: FloatArray
     residuals: tuple[FloatArray, ...]
     biot: tuple[FloatArray, ...]
     whitener: Whitener
@@ -66,13 +69,15 @@ class _Point:
     cost: float
 
 
-def with_gradients(problem: Problem, optimum: Optimum) -> WithGradients:
+def with_gradients(problem: Problem, optimum: Optimum, near: FloatArray | None = None) -> WithGradients:
     """Fit gradients within the nodes beside all unknowns, from an open-loop optimum.
 
     Parameters
     ----------
     problem, optimum
         A network fitted to open-loop trajectories; heat flows are those along its trajectories.
+    near : (n_unknowns,)
+        Where such a fit of a simpler network has ended: the better start counts.
 
     Raises
     ------
@@ -89,6 +94,8 @@ def with_gradients(problem: Problem, optimum: Optimum) -> WithGradients:
         return _Point(unknowns, fit, left_K, biot, 0.5 * (float(np.nansum((left_K / problem.noise_K) ** 2)) + against))
 
     here, damping = at(optimum.unknowns, optimum.fit), LEAST_DAMPING
+    if near is not None and np.isfinite((fit := problem.solve(near, near=optimum.fit)).cost):
+        here = min(here, at(near, fit), key=lambda point: point.cost)
     for _ in range(MOST_STEPS):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here, flows_K, of_sensor)
@@ -108,7 +115,7 @@ def with_gradients(problem: Problem, optimum: Optimum) -> WithGradients:
     against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())
     against += 0.5 * (problem.n_unknowns - problem.n_free) * float(np.log(problem.n_samples))
     log_posterior = whitener.log_likelihood - against - _averaged(whitener, flows_K)
-    return WithGradients(residuals, tuple(here.biot[own] for own in of_sensor), whitener, log_posterior)
+    return WithGradients(here.unknowns, residuals, tuple(here.biot[own] for own in of_sensor), whitener, log_posterior)
 
 
 def _equations(

@@ -311,6 +311,8 @@ def _judge(
     state: Search, start: Trial, option: tuple[Effect, ...], n_tried: int, *, n_passes: int, quick: bool = False
 ) -> Judged:
     """Fit an option on top of the state's effects, started from a trial close by."""
-    trial = replace(try_effects(start, (*state.trial.effects, *option), n_passes=n_passes), simpler=state.trial)
+    trial = replace(
+        try_effects(start, (*state.trial.effects, *option), n_passes=n_passes), simpler=state.trial, below=state.trial
+    )
     found = trial.effects[len(state.trial.effects) :]
     return Judged(found, weigh(state.trial, trial, n_tried, quick=quick), trial)

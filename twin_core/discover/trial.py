@@ -53,6 +53,8 @@ class Trial:
         Open-loop optima of the same problem found otherwise.
     simpler
         The trial that this one extends: its open-loop optimum is a start too, so that a richer model never fits worse.
+    below
+        A simpler trial whose fit beside gradients is a start of this one's.
     """
 
     effects: tuple[Effect, ...]
@@ -60,6 +62,7 @@ class Trial:
     max_step_s: float
     near: tuple[Optimum, ...] = ()
     simpler: "Trial | None" = None
+    below: "Trial | None" = None
 
     @once
     def calibration(self) -> Calibration:
@@ -105,9 +108,12 @@ class Trial:
         calibration = self.calibration()
         if self.excess().mean() <= by_chance(self.n_samples):
             return None
-        return attempted(
-            partial(with_gradients, calibration.problem, calibration.optimum), "gradients within nodes", []
-        )
+        problem, optimum, near = calibration.problem, calibration.optimum, None
+        below = None if self.below is None else self.below.beside_gradients()
+        if self.below is not None and below is not None:
+            own = problem.network.parameters.at_free(optimum.unknowns[: problem.n_free]).as_dict()
+            near = carried_over(self.below.fit.problem, below.unknowns, problem, own)
+        return attempted(partial(with_gradients, problem, optimum, near), "gradients within nodes", [])
 
     @once
     def along_trajectories(self) -> float:
@@ -246,7 +252,9 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
     fitted = partial(fit_with_undeclared_heat, problem, near=base.fit, n_passes=n_passes)
     fits = side_by_side([partial(fitted, start) for start in starts])
     fit = max(fits, key=lambda f: f.log_posterior)
-    return Trial(fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base)
+    return Trial(
+        fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base, below=base
+    )
 
 
 def try_on_trajectories(
@@ -277,7 +285,7 @@ def try_on_trajectories(
         return None
     fit = about_trajectory(problem, optimum)
     values = fit.network.parameters.as_dict()
-    return Trial(fitted_effects(effects, values), fit, base.max_step_s, (optimum,))
+    return Trial(fitted_effects(effects, values), fit, base.max_step_s, (optimum,), below=base)
 
 
 def resettled(simple: Trial, rich: Trial) -> Trial:
@@ -300,7 +308,7 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
     fits: list[HeatFit] = side_by_side([own, along, near])
     fit = max(fits, key=lambda f: f.log_posterior)
     effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
-    return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None)
+    return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None, below=simple)
 
 
 def converged(trial: Trial) -> Trial:
