@@ -59,6 +59,9 @@ class Validation:
         Segments of the training record.
     is_law
         Whether no effect is an event at an instant.
+    delivered
+        As ``ratio``, of what is handed out: calibrations without gradients within the nodes. Zero where the readings are likelier
+        without them.
     """
 
     ratio: float
@@ -68,6 +71,7 @@ class Validation:
     explained_share: float
     n_sessions: int = 1
     is_law: bool = True
+    delivered: float = 0.0
 
     @property
     def foresight(self) -> float:
@@ -115,19 +119,27 @@ def _n_instants(trial: Trial) -> int:
 
 def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
-    misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
+    misfits = [np.concatenate(t.likeliest().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
     instant = _last_instant(simple, rich)
     foretold = [simple.forward_error, rich.forward_error] if instant is None else []
-    ask_each(simple.block_errors, rich.block_errors, *foretold)
+    beside_gradients = any(t.likeliest() is not t.calibration() for t in (simple, rich))
+    plain = [simple.plain_block_errors, rich.plain_block_errors] if beside_gradients else []
+    ask_each(simple.block_errors, rich.block_errors, *foretold, *plain)
     before, after = simple.block_errors(), rich.block_errors()
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
-    ratio = max(float(np.sqrt(after.sum() / max(before.sum(), 1e-300))), where_fitted)
+    ratio = max(_rms_ratio(before, after), where_fitted)
     forward = _forward_ratio(simple, rich, instant)
     better = float(np.mean(after < before))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
-    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
+    delivered = _rms_ratio(*[errors() for errors in plain]) if plain else 0.0
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law, delivered)
+
+
+def _rms_ratio(before: FloatArray, after: FloatArray) -> float:
+    """Return the error over all blocks, after over before (rms)."""
+    return float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
 
 
 def _last_instant(simple: Trial, rich: Trial) -> float | None:
@@ -151,7 +163,7 @@ def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
-        before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
+        before, after = side_by_side([partial(forward_error, t.likeliest(), instant) for t in (simple, rich)])
     return float(np.sqrt(after / max(before, 1e-300))) if before > 0.0 else 1.0
 
 

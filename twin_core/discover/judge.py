@@ -286,7 +286,7 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
     if coinciding_channel(judged.trial, judged.effects) is not None:
         return replace(judged, reason=COINCIDES), False
     validation = validate(simple, judged.trial)
-    if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
+    if not validation.foresight < policy.FORESIGHT ** len(judged.effects) or validation.delivered > 1.0:
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     reason = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=reason), bool(reason)

@@ -66,11 +66,11 @@ THRESHOLDS: dict[str, Threshold] = {
     ),
     "LEAST_COARSENESS": Threshold(
         NOISE_VARIANCE,
-        "what a network that is coarse at all counts as leaving, because names may have soaked it up",
-        "healthy finite-element spacecraft, whose misfit is one to two noises",
+        "what a network that is coarse at all counts as leaving beside gradients within nodes, as names may have soaked it up",
+        "healthy finite-element spacecraft, whose misfit is one to two noises: beside gradients up to two thirds of one stay",
         0.0,
-        0.75,
-        3.0,
+        0.25,
+        1.0,
     ),
     "MOST_COARSENESS": Threshold(
         NOISE_VARIANCE,

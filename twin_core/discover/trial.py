@@ -85,12 +85,17 @@ class Trial:
     @once
     def block_errors(self) -> FloatArray:
         """Sum of squared weighted errors on each block predicted from the others, (n_blocks,)."""
+        return blocked_errors(self.likeliest())
+
+    @once
+    def plain_block_errors(self) -> FloatArray:
+        """The same of the calibration without gradients, which is what a corrected model is handed out as, (n_blocks,)."""
         return blocked_errors(self.calibration())
 
     @once
     def forward_error(self) -> float:
         """Sum of squared weighted errors over parts of the training record that a refit has not seen."""
-        return forward_error(self.calibration())
+        return forward_error(self.likeliest())
 
     @once
     def misfit_share(self) -> float:
@@ -110,10 +115,18 @@ class Trial:
             return None
         problem, optimum, near = calibration.problem, calibration.optimum, None
         below = None if self.below is None else self.below.beside_gradients()
-        if self.below is not None and below is not None:
+        if below is not None:
             own = problem.network.parameters.at_free(optimum.unknowns[: problem.n_free]).as_dict()
-            near = carried_over(self.below.fit.problem, below.unknowns, problem, own)
+            near = carried_over(below.problem, below.optimum.unknowns, problem, own)
         return attempted(partial(with_gradients, problem, optimum, near), "gradients within nodes", [])
+
+    @once
+    def likeliest(self) -> Calibration:
+        """The open-loop calibration, beside gradients within the nodes where the readings are likelier with them."""
+        calibration, gradients = self.calibration(), self.beside_gradients()
+        if gradients is None or gradients.log_posterior <= calibration.log_posterior:
+            return calibration
+        return Calibration(gradients.problem, gradients.optimum, gradients.whitener, calibration.max_step_s)
 
     @once
     def along_trajectories(self) -> float:
@@ -155,11 +168,8 @@ class Trial:
 
     @once
     def unexplained(self) -> float:
-        """The same, mean over sensors, beside gradients within the nodes where the readings are likelier with them."""
-        gradients = self.beside_gradients()
-        if gradients is None or gradients.log_posterior <= self.calibration().log_posterior:
-            return mean_excess(self)
-        return float(np.mean(self._excess(gradients.residuals)))
+        """The same for the likeliest open-loop calibration, mean over sensors."""
+        return float(np.mean(self._excess(self.likeliest().residuals)))
 
     @property
     def n_samples(self) -> int:
