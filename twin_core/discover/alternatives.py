@@ -69,7 +69,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         [(partial(_explaining, simple, start, effect, least), in_place(effect)) for start, effect in options]
     )
     best: dict[Place, Trial] = {}
-    for trial in sorted((trial for trial in fitted if trial is not None), key=Trial.unexplained):
+    for trial in sorted((trial for trial in fitted if trial is not None), key=lambda trial: trial.unexplained()):
         best.setdefault(trial.effects[-1].place, trial)
     told = state.attempt_each(
         [(partial(_supported, state, simple, t, needed), in_place(t.effects[-1])) for t in best.values()]

@@ -279,7 +279,7 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
 
     A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
     """
-    if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
+    if judged.trial.along_trajectories() < simple.along_trajectories():
         return replace(judged, reason=LESS_LIKELY), False
     if least_wald_score(simple, judged.trial) < score_needed(needed):
         return replace(judged, reason=SIZE_NOT_DETERMINED), False

@@ -60,6 +60,9 @@ class Stub:
     def excess(self) -> Any:
         return np.array([2.0 * self.left, 0.0])
 
+    def unexplained(self) -> float:
+        return float(self.excess().mean())
+
 
 def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
     return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))

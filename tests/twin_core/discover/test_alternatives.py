@@ -54,8 +54,8 @@ class Fits:
         return self.trial(self.rough[start.name], self.fine[0])
 
     def resettled(self, simple: Trial, rich: Any) -> Any:
-        self.settled.append(alternatives.mean_excess(rich))
-        return self.trial(alternatives.mean_excess(rich), self.fine[1])
+        self.settled.append(rich.unexplained())
+        return self.trial(rich.unexplained(), self.fine[1])
 
     def told(self) -> list[str]:
         finding = Finding(judged("a", 50.0))

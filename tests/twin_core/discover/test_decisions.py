@@ -242,9 +242,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
     option = judged("a", 900.0)
     along = {True: 5.0, False: 5.0 + change}
     simple = stub()
-    monkeypatch.setattr(
-        Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
-    )
+    monkeypatch.setattr(Stub, "along_trajectories", lambda own: along[own is simple], raising=False)
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
     monkeypatch.setattr(judge, "least_wald_score", lambda *trials: score)
     monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: channel)
