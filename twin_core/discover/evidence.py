@@ -59,9 +59,6 @@ class Validation:
         Segments of the training record.
     is_law
         Whether no effect is an event at an instant.
-    delivered
-        As ``ratio``, of what is handed out: calibrations without gradients within the nodes. Zero where the readings are likelier
-        without them.
     """
 
     ratio: float
@@ -71,7 +68,6 @@ class Validation:
     explained_share: float
     n_sessions: int = 1
     is_law: bool = True
-    delivered: float = 0.0
 
     @property
     def foresight(self) -> float:
@@ -122,9 +118,7 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     misfits = [np.concatenate(t.likeliest().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
     instant = _last_instant(simple, rich)
     foretold = [simple.forward_error, rich.forward_error] if instant is None else []
-    beside_gradients = any(t.likeliest() is not t.calibration() for t in (simple, rich))
-    plain = [simple.plain_block_errors, rich.plain_block_errors] if beside_gradients else []
-    ask_each(simple.block_errors, rich.block_errors, *foretold, *plain)
+    ask_each(simple.block_errors, rich.block_errors, *foretold)
     before, after = simple.block_errors(), rich.block_errors()
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
     ratio = max(_rms_ratio(before, after), where_fitted)
@@ -133,8 +127,18 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
-    delivered = _rms_ratio(*[errors() for errors in plain]) if plain else 0.0
-    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law, delivered)
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
+
+
+def predicts_worse_without_gradients(simple: Trial, rich: Trial) -> bool:
+    """Return whether blocks are predicted worse by the calibrations without gradients, as which a correction is handed out.
+
+    Asked only where the readings of one of the trials are likelier beside gradients: validation has asked it otherwise.
+    """
+    if all(trial.likeliest() is trial.calibration() for trial in (simple, rich)):
+        return False
+    ask_each(simple.plain_block_errors, rich.plain_block_errors)
+    return _rms_ratio(simple.plain_block_errors(), rich.plain_block_errors()) > 1.0
 
 
 def _rms_ratio(before: FloatArray, after: FloatArray) -> float:

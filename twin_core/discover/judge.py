@@ -12,7 +12,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import coinciding_channel
-from twin_core.discover.evidence import Evidence, Validation, validate
+from twin_core.discover.evidence import Evidence, Validation, predicts_worse_without_gradients, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
 from twin_core.discover.trial import Trial, by_chance
@@ -286,7 +286,8 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
     if coinciding_channel(judged.trial, judged.effects) is not None:
         return replace(judged, reason=COINCIDES), False
     validation = validate(simple, judged.trial)
-    if not validation.foresight < policy.FORESIGHT ** len(judged.effects) or validation.delivered > 1.0:
+    foretold = validation.foresight < policy.FORESIGHT ** len(judged.effects)
+    if not foretold or predicts_worse_without_gradients(simple, judged.trial):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     reason = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=reason), bool(reason)

@@ -228,7 +228,8 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
     ranked = sorted(finding.alternatives, key=worth)
     better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in ranked if _freedom(j) < _freedom(own) and is_close(j, own)]
     better += [(j, needed, np.inf) for j in ranked if worth(j) < worth(own) - needed]
-    asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in ranked)
+    no_freer = [j for j in ranked if _freedom(j) <= _freedom(own)]
+    asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in no_freer)
     less = [(value, j) for j, value in asked if value is not None and value < state.trial.unexplained()]
     better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
     for best, margin, foresight in better:

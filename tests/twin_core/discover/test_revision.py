@@ -452,6 +452,17 @@ def test_of_names_alike_the_one_leads_that_leaves_less_and_predicts_better(
     assert [a.effects[0].where["node"] for a in finding.alternatives] == [{"a": "b", "b": "a"}[leads]]
 
 
+def test_one_with_more_freedom_leaves_less_and_does_not_lead_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    freer = REGISTRY["nonlinear_convection"]({"node": "a", "boundary": "bus"}, {"k": 1.0, "p": 1.0})
+    option = Judged((freer,), Evidence(89.0, 0.0), stub(freer, left=1.0, foresight=0.1))
+    told = Finding(judged("a", 90.0), (option,))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    state = Search(stub(load("a"), left=2.0, foresight=0.9), stub(), findings=[Finding(judged("a", 90.0))])
+    tell_alternatives(state, NEEDED)
+    assert state.findings == [told]
+
+
 def test_nothing_is_named_that_was_tried_beside_what_no_longer_stands() -> None:
     state = Search(stub(), stub())
     option = judged("a", 90.0)
