@@ -13,11 +13,15 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, acceptance, stated_guesses, with_met
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.discover.judge import Finding, Judged, Search
+from twin_core.discover.trial import mean_excess
 from twin_core.effects.base import Effect
 from twin_core.holdout import HeldOut, Prediction
 from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out, sensitivity
 from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
+
+MOSTLY = 0.5
+"""Share of a misfit from which it is said what explains it."""
 
 WORSE_THERE = 3.0
 """A ratio of errors (rms), which decides about a notice only: a misfit of two noises makes it 2.2 by itself. Of 32 measured
@@ -188,6 +192,20 @@ def _along_trajectories(search: Search) -> list[str]:
     ]
 
 
+def _beside_gradients(search: Search) -> list[str]:
+    """Say where what trajectories leave is what temperature gradients within the nodes would leave: the network is coarse."""
+    trial = search.trial
+    if trial.likeliest() is trial.calibration():
+        return []
+    share = 1.0 - trial.unexplained() / mean_excess(trial)
+    if share <= MOSTLY:
+        return []
+    return [
+        f"the model leaves more than the sensors' noise, and temperature gradients within the nodes explain {share:.0%} of that: a "
+        "sensor reads one place of a body, a node stands for its mean, so a finer network would describe it"
+    ]
+
+
 def unexplained_share(calibration: Calibration) -> float:
     """Return the part of the open-loop residuals' variance over the training part that is beyond the sensors' noise."""
     scaled = np.concatenate(calibration.residuals) / calibration.problem.noise_K
@@ -270,6 +288,7 @@ def build_report(
         "notices": [
             *_doubts(search, scores),
             *_along_trajectories(search),
+            *(attempted(lambda: _beside_gradients(search), "gradients within nodes", failures) or []),
             *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),

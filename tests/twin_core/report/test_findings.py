@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from twin_core.discover.evidence import Evidence
@@ -41,3 +42,18 @@ def test_what_trajectories_alone_support_is_said() -> None:
     assert build._along_trajectories(Search(trial, trial, findings=[told])) == []
     (notice,) = build._along_trajectories(Search(trial, trial, findings=[told, alone]))
     assert "constant_heat_load(b)" in notice and "trajectories alone" in notice
+
+
+@pytest.mark.parametrize(("left", "said"), [(0.4, "90%"), (2.1, None)])
+def test_a_misfit_that_gradients_explain_is_said_to_be_coarse(left: float, said: str | None) -> None:
+    """Where the readings are likelier with them, and they explain most of it."""
+    beside: Any = SimpleNamespace(
+        calibration=lambda: "plain",
+        likeliest=lambda: "beside",
+        unexplained=lambda: left,
+        excess=lambda: np.array([4.0, 4.0]),
+    )
+    notices = build._beside_gradients(Search(beside, beside))
+    assert [said in notice for notice in notices] == ([True] if said else [])
+    beside.likeliest = beside.calibration
+    assert build._beside_gradients(Search(beside, beside)) == []
