@@ -201,7 +201,7 @@ def _beside_gradients(search: Search) -> list[str]:
     if share <= MOSTLY:
         return []
     return [
-        f"the model leaves more than the sensors' noise, and temperature gradients within the nodes explain {share:.0%} of that: a "
+        f"the model leaves more than the sensors' noise; temperature gradients within the nodes explain {share:.0%} of that: a "
         "sensor reads one place of a body, a node stands for its mean, so a finer network would describe it"
     ]
 
