@@ -16,6 +16,7 @@ from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Fit, Problem, Segment
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
+from twin_core.effects.hidden_mass import first_order_lag
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Network
 from twin_core.network.surroundings import surround
@@ -25,10 +26,10 @@ from twin_core.simulate.rollout import Rollout
 BIOT = 0.1
 """Standard deviation of every b_l before anything is measured, a Biot number."""
 
-MOST_STEPS = 10
+MOST_STEPS, MOST_STEPS_NEAR = 30, 10
 SETTLED_SHARE = 1e-3
-"""The fit ends where a step lowers the cost by no more, or after so many: a limit of time. Steps of Gauss and Newton that gain a
-thousandth leave less than a nat of ten thousand readings."""
+"""The fit ends where a step lowers the cost by no more, or after so many, fewer where it starts near another one: a limit of
+time. Steps of Gauss and Newton that gain a thousandth leave less than a nat of ten thousand readings."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e4
 """Of the diagonal of the Hessian (Levenberg and Marquardt)."""
@@ -102,7 +103,7 @@ def with_gradients(problem: Problem, optimum: Optimum, near: FloatArray | None =
     here, damping = at(optimum.unknowns, optimum.fit), LEAST_DAMPING
     if near is not None and np.isfinite((fit := problem.solve(near, near=optimum.fit)).cost):
         here = min(here, at(near, fit), key=lambda point: point.cost)
-    for _ in range(MOST_STEPS):
+    for _ in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here, flows_K, of_sensor)
         while damping < MOST_DAMPING:
@@ -202,16 +203,17 @@ def heat_flows_K(problem: Problem, optimum: Optimum) -> list[FloatArray]:
     for link in (link for of_segment in links for link in of_segment):
         conductance[link.node] += link.conductance_W_per_K / len(links)
     found = []
-    for sensor in network.spec.sensors:
+    for sensor, state in zip(network.spec.sensors, network.sensor_node.tolist(), strict=True):
         node = network.layout.node(network.layout.sensor_node(sensor))
         own = [k for k, link in enumerate(links[0]) if link.node == node and conductance[node] > 0.0]
-        parts = [
-            np.stack([of_segment[k].heat_W[_at_samples(s)] for k in own], axis=1)
-            if own
-            else np.zeros((s.record.time_s.size, 0))
-            for of_segment, s in zip(links, problem.segments, strict=True)
-        ]
-        found.append(np.concatenate(parts) / max(conductance[node], 1e-300))
+        parts = []
+        for of_segment, s in zip(links, problem.segments, strict=True):
+            columns = [of_segment[k].heat_W[_at_samples(s)] / conductance[node] for k in own]
+            if state != node and conductance[state] > 0.0:  # a sensor that lags behind what it is attached to
+                tau_s = float(values[network.capacity_index[state]] / conductance[state])
+                columns = [first_order_lag(s.record.time_s, column, tau_s) for column in columns]
+            parts.append(np.stack(columns, axis=1) if columns else np.zeros((s.record.time_s.size, 0)))
+        found.append(np.concatenate(parts))
     return found
 
 

@@ -1,9 +1,11 @@
 """Gradients within nodes: sensors off the mean of their node, against dense marginal likelihoods and a body that has them."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import StateSpace, lsim
 from scipy.stats import multivariate_normal
 
 from tests.analytic import laplacian, linear_states
@@ -11,6 +13,8 @@ from tests.helpers import conductive_spec, record_of
 from twin_core._typing import FloatArray
 from twin_core.calibrate.gradients import BIOT, heat_flows_K, with_gradients
 from twin_core.calibrate.second_order import Calibration, fit_network
+from twin_core.effects import REGISTRY
+from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -126,3 +130,21 @@ def test_a_node_that_gives_its_heat_to_nothing_has_no_gradients() -> None:
     found = with_gradients(calibration.problem, calibration.optimum)
     assert found.biot[0].size == 0
     assert found.log_posterior == pytest.approx(calibration.log_posterior, abs=0.1)
+
+
+def test_a_sensor_that_lags_reads_its_gradients_late() -> None:
+    """Its place on the body has a temperature, behind which it lags. The oracle is SciPy's first-order filter."""
+    plain, step_s, tau_s = fitted(1.0), 60.0, 300.0
+    values = plain.network.parameters.as_dict()
+    network = build_network(load_spec(spec()), [REGISTRY["sensor_lag"]({"sensor": "T0"}, {"tau_s": tau_s})])
+    problem = plain.problem.with_network(network.with_parameters(network.parameters.updated(values)))
+    start = problem.start()
+    with_lag = heat_flows_K(problem, replace(plain.optimum, unknowns=start, fit=problem.solve(start)))
+    without = plain.problem.with_network(plain.network)
+    begun = without.start()
+    now = heat_flows_K(without, replace(plain.optimum, unknowns=begun, fit=without.solve(begun)))
+    states = StateSpace(-1.0 / tau_s, 1.0 / tau_s, 1.0, 0.0)
+    time_s = step_s * np.arange(400)
+    for late, flow in zip(with_lag[0].T, now[0].T, strict=False):
+        assert late == pytest.approx(lsim(states, flow, time_s, X0=flow[0])[1], abs=1e-3)
+    assert with_lag[1] == pytest.approx(now[1], abs=1e-9)
