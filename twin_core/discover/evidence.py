@@ -114,8 +114,11 @@ def _n_instants(trial: Trial) -> int:
 
 
 def validate(simple: Trial, rich: Trial) -> Validation:
-    """Return how the rich trial predicts blocks that it was not fitted to, against the simple one."""
-    misfits = [np.concatenate(t.likeliest().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
+    """Return how the rich trial predicts blocks that it was not fitted to, against the simple one.
+
+    Both as they are handed out, without gradients within the nodes.
+    """
+    misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
     instant = _last_instant(simple, rich)
     foretold = [simple.forward_error, rich.forward_error] if instant is None else []
     ask_each(simple.block_errors, rich.block_errors, *foretold)
@@ -128,17 +131,6 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
     return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
-
-
-def predicts_worse_without_gradients(simple: Trial, rich: Trial) -> bool:
-    """Return whether blocks are predicted worse by the calibrations without gradients, as which a correction is handed out.
-
-    Asked only where the readings of one of the trials are likelier beside gradients: validation has asked it otherwise.
-    """
-    if all(trial.likeliest() is trial.calibration() for trial in (simple, rich)):
-        return False
-    ask_each(simple.plain_block_errors, rich.plain_block_errors)
-    return _rms_ratio(simple.plain_block_errors(), rich.plain_block_errors()) > 1.0
 
 
 def _rms_ratio(before: FloatArray, after: FloatArray) -> float:
@@ -167,7 +159,7 @@ def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
-        before, after = side_by_side([partial(forward_error, t.likeliest(), instant) for t in (simple, rich)])
+        before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
     return float(np.sqrt(after / max(before, 1e-300))) if before > 0.0 else 1.0
 
 

@@ -12,7 +12,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import coinciding_channel
-from twin_core.discover.evidence import Evidence, Validation, predicts_worse_without_gradients, validate
+from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
 from twin_core.discover.trial import Trial, by_chance
@@ -279,15 +279,14 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
 
     A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
     """
-    if judged.trial.along_trajectories() < simple.along_trajectories():
+    if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
     if least_wald_score(simple, judged.trial) < score_needed(needed):
         return replace(judged, reason=SIZE_NOT_DETERMINED), False
     if coinciding_channel(judged.trial, judged.effects) is not None:
         return replace(judged, reason=COINCIDES), False
     validation = validate(simple, judged.trial)
-    foretold = validation.foresight < policy.FORESIGHT ** len(judged.effects)
-    if not foretold or predicts_worse_without_gradients(simple, judged.trial):
+    if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     reason = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=reason), bool(reason)

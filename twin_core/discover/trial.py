@@ -85,17 +85,12 @@ class Trial:
     @once
     def block_errors(self) -> FloatArray:
         """Sum of squared weighted errors on each block predicted from the others, (n_blocks,)."""
-        return blocked_errors(self.likeliest())
-
-    @once
-    def plain_block_errors(self) -> FloatArray:
-        """The same of the calibration without gradients, which is what a corrected model is handed out as, (n_blocks,)."""
         return blocked_errors(self.calibration())
 
     @once
     def forward_error(self) -> float:
         """Sum of squared weighted errors over parts of the training record that a refit has not seen."""
-        return forward_error(self.likeliest())
+        return forward_error(self.calibration())
 
     @once
     def misfit_share(self) -> float:

@@ -11,7 +11,7 @@ from twin_core.calibrate.covariance import trajectory_covariance
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
 from twin_core.calibrate.second_order import Calibration
-from twin_core.discover.trial import Trial, extended, fitted_effects, shared_unknowns
+from twin_core.discover.trial import Trial, extended, shared_unknowns
 from twin_core.effects.base import Effect
 
 LESS = 0.1
@@ -47,7 +47,7 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     ArithmeticError
         Where the covariance is not finite.
     """
-    calibration = rich.likeliest()
+    calibration = rich.calibration()
     covariance = trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
     if not np.isfinite(covariance).all():
         raise ArithmeticError("the covariance of the effects is not finite")
@@ -57,8 +57,7 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     )
     known = {effect.place for effect in simple.effects}
     scores = []
-    values = calibration.network.parameters.as_dict()
-    for own in fitted_effects(rich.effects, values):
+    for own in rich.present_effects:
         if own.place not in known:
             rest = [e for e in rich.effects if e.place != own.place]
             others = _without(calibration, simple.fit.problem, rest), _with_less(calibration, own)

@@ -63,6 +63,9 @@ class Stub:
     def unexplained(self) -> float:
         return float(self.excess().mean())
 
+    def log_evidence(self) -> float:
+        return 0.0
+
 
 def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:
     return cast(Trial, Stub(tuple(effects), left, n_free, foresight=foresight))

@@ -226,26 +226,26 @@ SCORE = score_needed(NEEDED)
 
 
 @pytest.mark.parametrize(
-    ("change", "score", "channel", "worse", "reason"),
+    ("change", "score", "channel", "reason"),
     [
-        (0.0, SCORE, None, False, ""),
-        (-JUST, SCORE, None, False, LESS_LIKELY),
-        (0.0, SCORE - JUST, None, False, SIZE_NOT_DETERMINED),
-        (0.0, SCORE, "P", False, COINCIDES),
-        (0.0, SCORE, None, True, NO_FORESIGHT),
+        (0.0, SCORE, None, ""),
+        (-JUST, SCORE, None, LESS_LIKELY),
+        (0.0, SCORE - JUST, None, SIZE_NOT_DETERMINED),
+        (0.0, SCORE, "P", COINCIDES),
     ],
-    ids=["all are enough", "less likely along its trajectories", "of no size", "with an input", "worse as handed out"],
+    ids=["all are enough", "less likely along its trajectories", "of no size", "with an input"],
 )
 def test_a_correction_is_told_by_its_own_trajectories(
-    monkeypatch: pytest.MonkeyPatch, change: float, score: float, channel: str | None, worse: bool, reason: str
+    monkeypatch: pytest.MonkeyPatch, change: float, score: float, channel: str | None, reason: str
 ) -> None:
     """However much heat that wanders at the nodes may speak for it."""
     option = judged("a", 900.0)
     along = {True: 5.0, False: 5.0 + change}
     simple = stub()
-    monkeypatch.setattr(Stub, "along_trajectories", lambda own: along[own is simple], raising=False)
+    monkeypatch.setattr(
+        Stub, "calibration", lambda own: SimpleNamespace(log_posterior=along[own is simple]), raising=False
+    )
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
-    monkeypatch.setattr(judge, "predicts_worse_without_gradients", lambda *trials: worse)
     monkeypatch.setattr(judge, "least_wald_score", lambda *trials: score)
     monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: channel)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")

@@ -258,3 +258,16 @@ def test_a_simpler_model_that_runs_away_where_a_block_is_left_out_makes_an_effec
     before, after = (np.nanmean(np.concatenate(trial.calibration().residuals) ** 2) for trial in trials)
     monkeypatch.setattr(Trial, "block_errors", lambda own: np.full(N_BLOCKS, 1e9 if own is base else 1.0))
     assert validate(base, right).ratio == pytest.approx(np.sqrt(after / before))
+
+
+def test_a_correction_is_validated_as_it_is_handed_out(
+    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without gradients within the nodes: beside them a second name halved what it was not fitted to, and was worse than none."""
+    base, right = (replace(trial) for trial in trials)
+
+    def beside(own: Trial) -> None:
+        raise AssertionError("gradients are not handed out")
+
+    monkeypatch.setattr(Trial, "beside_gradients", beside)
+    assert validate(base, right).foresight < 0.5
