@@ -86,6 +86,7 @@ bench-ablation: $(BENCH)
 	for seed in 1000 5000; do $(BIN)/python -m benchmarks.cases --out ablation-cases --first-seed $$seed --limit 3 --networks 1; done
 	$(BIN)/python -m benchmarks.ablation --cases ablation-cases
 	$(BIN)/python -m benchmarks.lone_changes
+	$(BIN)/python -m benchmarks.gradients
 
 bench-decoys: $(BENCH)
 	$(BIN)/python -m benchmarks.decoys

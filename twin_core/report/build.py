@@ -194,9 +194,9 @@ def _along_trajectories(search: Search) -> list[str]:
 
 def _beside_gradients(search: Search) -> list[str]:
     """Say where what trajectories leave is what temperature gradients within the nodes would leave: the network is coarse."""
-    trial = search.trial
-    if trial.likeliest() is trial.calibration():
-        return []
+    trial, gradients = search.trial, search.trial.beside_gradients()
+    if gradients is None or gradients.log_posterior <= max(trial.fit.log_posterior, trial.calibration().log_posterior):
+        return []  # heat that wanders, or a misfit that does, describes it better
     share = 1.0 - trial.unexplained() / mean_excess(trial)
     if share <= MOSTLY:
         return []

@@ -44,16 +44,19 @@ def test_what_trajectories_alone_support_is_said() -> None:
     assert "constant_heat_load(b)" in notice and "trajectories alone" in notice
 
 
-@pytest.mark.parametrize(("left", "said"), [(0.4, "90%"), (2.1, None)])
-def test_a_misfit_that_gradients_explain_is_said_to_be_coarse(left: float, said: str | None) -> None:
-    """Where the readings are likelier with them, and they explain most of it."""
-    beside: Any = SimpleNamespace(
-        calibration=lambda: "plain",
-        likeliest=lambda: "beside",
+@pytest.mark.parametrize(
+    ("left", "beside", "said"),
+    [(0.4, 9.0, True), (2.1, 9.0, False), (0.4, 8.0, False), (0.4, None, False)],
+    ids=["most of it", "half of it", "heat that wanders is as likely", "fits to the noise"],
+)
+def test_a_misfit_that_gradients_explain_is_said_to_be_coarse(left: float, beside: float | None, said: bool) -> None:
+    """Where they are the likeliest of all that may explain it, and explain most of it: on a rig they may stand for a lag."""
+    trial: Any = SimpleNamespace(
+        fit=SimpleNamespace(log_posterior=8.0),
+        calibration=lambda: SimpleNamespace(log_posterior=7.0),
+        beside_gradients=lambda: beside and SimpleNamespace(log_posterior=beside),
         unexplained=lambda: left,
         excess=lambda: np.array([4.0, 4.0]),
     )
-    notices = build._beside_gradients(Search(beside, beside))
-    assert [said in notice for notice in notices] == ([True] if said else [])
-    beside.likeliest = beside.calibration
-    assert build._beside_gradients(Search(beside, beside)) == []
+    notices = build._beside_gradients(Search(trial, trial))
+    assert ["90%" in notice for notice in notices] == [True] * said
