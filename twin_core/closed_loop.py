@@ -27,6 +27,7 @@ from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
+from twin_core.quality.gaps import cut_where_inputs_are_unknown
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
 from twin_core.report.mistakes import told_mistakes
@@ -116,9 +117,11 @@ def close_loop(
         records = [screened(spec, record) for record in records]
         holdout_records = [screened(spec, record) for record in holdout_records or ()]
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
+        train = cut_where_inputs_are_unknown(train, spec.held_inputs)
         check_moments(train, moments)
         fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
         before = to_model(calibration, ())
+        declared = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         base, every = searched(whole)
         found = search(
@@ -130,7 +133,6 @@ def close_loop(
         )
         found.every = every
         progress(0.88, "predicting the hold-out")
-        declared = [predict(before, h) for h in held]
         after, predicted = _corrected(whole, found, held) or (before, declared)
         predictions = (declared, predicted)
         report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
@@ -147,6 +149,27 @@ def close_loop(
         report["elapsed_s"] = time.perf_counter() - begun
         progress(1.0, "done")
         return ClosedLoop(report, after, before, plots)
+
+
+def _predicted(declared: CalibratedModel, held: Sequence[HeldOut]) -> list[Prediction]:
+    """Return what the declared model predicts.
+
+    Raises
+    ------
+    ModelError
+        Where its balance has no solution over the hold-out: with what the training part does not tell of its parameters, which
+        inputs that rested there may bring to light.
+    """
+    try:
+        return [predict(declared, h) for h in held]
+    except ModelError as error:
+        words = declared.summary["words"]
+        advice = (
+            f"; the training part leaves open: {'; '.join(words)}; give such parameters a value or bounds"
+            if words
+            else ""
+        )
+        raise ModelError(f"{error}{advice}") from error
 
 
 def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[CalibratedModel, list[Prediction]] | None:

@@ -128,7 +128,10 @@ class Record:
 
     def parts(self, longest_s: float, held: AbstractSet[str]) -> list[Self]:
         """Return the record cut at intervals of more than ``longest_s``; ``held`` channels keep their values across."""
-        starts = [0, *(np.flatnonzero(np.diff(self.time_s) > longest_s) + 1).tolist()]
+        return self.parts_from([0, *(np.flatnonzero(np.diff(self.time_s) > longest_s) + 1).tolist()], held)
+
+    def parts_from(self, starts: Sequence[int], held: AbstractSet[str]) -> list[Self]:
+        """Return the record cut before each of some samples, the first of them 0; ``held`` channels keep their values across."""
         if len(starts) == 1:
             return [self]
         stops, last, parts = [*starts[1:], self.time_s.size], dict.fromkeys(held, np.nan), []

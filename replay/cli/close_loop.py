@@ -14,11 +14,8 @@ if TYPE_CHECKING:
     from twin_core.closed_loop import ClosedLoop
     from twin_core.report.dossier import Moment
 
-VERDICTS = {
-    "effect_added": "an undeclared effect was found and added",
-    "no_effect_supported": "the declared model suffices: no effect is supported by the data",
-    "unexplained": "something is missing that no known effect explains",
-}
+
+FOUND = "an undeclared effect was found and added"
 
 
 @click.command(
@@ -220,9 +217,9 @@ def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -
 def print_report(report: dict[str, Any]) -> None:
     """Print the verdict, the findings and the held-out error before and after."""
     from replay.cli.console import print_line, print_table, short
-    from twin_core.report.phrasing import sentence
+    from twin_core.report.phrasing import headline, sentence
 
-    print_line(f"{report['twin']}: {VERDICTS[report['verdict']]}")
+    print_line(f"{report['twin']}: {FOUND if report['findings'] else headline(report)}")
     for finding in report["findings"]:
         print_line(f"  {sentence(finding)}")
         print_line(f"  {describe(finding)}; log Bayes factor {short(finding['evidence']['log_bayes_factor'])}")

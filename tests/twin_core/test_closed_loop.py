@@ -3,7 +3,8 @@
 import json
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -124,6 +125,18 @@ def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.M
     assert report["findings"] == [] and report["verdict"] != "effect_added"
     assert report["after"] == report["before"]
     assert any("no solution over the hold-out" in reason for reason in report["failures"])
+
+
+def test_a_declared_model_that_cannot_predict_says_what_the_record_leaves_open() -> None:
+    """A heater that rests in training and runs afterwards: the fit may have shrunk what it heats to nothing."""
+    words = ["the data do not determine C:b; it ended 91 times below its guess"]
+
+    def fails(model: Any, held: HeldOut) -> Prediction:
+        raise ModelError("b.csv: the heat balance has no solution over the hold-out")
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(ModelError, match=r"no solution.*C:b.*a value or bounds"):
+        patch.setattr(closed_loop, "predict", fails)
+        closed_loop._predicted(SimpleNamespace(summary={"words": words}), [cast(HeldOut, None)])  # type: ignore[arg-type]
 
 
 def check_score(score: dict[str, Any], sensors: tuple[str, ...]) -> None:

@@ -21,6 +21,7 @@ from twin_core.discover.trial import (
     Trial,
     about_trajectory,
     by_chance,
+    explained,
     mean_excess,
     resettled,
     shared_unknowns,
@@ -50,7 +51,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     own = finding.effects[0]
     if len(finding.effects) != 1 or own.fallback or left <= by_chance(state.trial.n_samples):
         return finding
-    least = (1.0 - policy.REPEATABLE_SHARE) * (simple.unexplained() - state.trial.unexplained())
+    least = (1.0 - policy.REPEATABLE_SHARE) * explained(simple, state.trial)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
     starts = [simple.calibration()]
     bare = state.attempt(
@@ -66,7 +67,10 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
 
     options = [(start, effect) for fit, start in fits for effect in _near(simple, fit, own, known)]
     fitted = state.attempt_each(
-        [(partial(_explaining, simple, start, effect, least), in_place(effect)) for start, effect in options]
+        [
+            (partial(_explaining, simple, start, effect, state.trial, least), in_place(effect))
+            for start, effect in options
+        ]
     )
     best: dict[Place, Trial] = {}
     for trial in sorted((trial for trial in fitted if trial is not None), key=lambda trial: trial.unexplained()):
@@ -106,10 +110,11 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
     return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
 
 
-def _explaining(simple: Trial, start: Calibration, effect: Effect, least: float) -> Trial | None:
-    """Return an effect on top of a trial, fitted on trajectories, if it explains at least so much of the misfit."""
+def _explaining(simple: Trial, start: Calibration, effect: Effect, found: Trial, least: float) -> Trial | None:
+    """Return an effect on top of a trial, fitted on trajectories, if it explains at least so much of the misfit as it is with
+    what was found."""
     trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
-    return None if trial is None or simple.unexplained() - trial.unexplained() < least else trial
+    return None if trial is None or explained(simple, trial, found) < least else trial
 
 
 def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:

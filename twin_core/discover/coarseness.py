@@ -5,7 +5,7 @@ import numpy as np
 from twin_core.calibrate.containment import attempted
 from twin_core.discover import policy
 from twin_core.discover.evidence import validate
-from twin_core.discover.trial import Trial, by_chance, mean_excess
+from twin_core.discover.trial import Trial, by_chance, explained, mean_excess
 
 
 def least_explained(beside: float, left: float, n_readings: int, *, is_named: bool = True) -> float:
@@ -45,12 +45,12 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
     is_named
         Whether names were added: a heat without a name has no less to explain.
     """
-    explained = simple.unexplained() - rich.unexplained()
+    told_by = explained(simple, rich)
     alone = is_named and not simple.effects
     told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
     if told is not None:
         asked *= min(1.0, policy.DOMINANCE * told**2)
-    return explained / asked if asked > 0.0 else np.inf
+    return told_by / asked if asked > 0.0 else np.inf
 
 
 def stands(simple: Trial, rich: Trial) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from twin_core.discover.evidence import weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
-from twin_core.discover.trial import Trial, try_effects
+from twin_core.discover.trial import Trial, explained, try_effects
 from twin_core.effects.base import Effect, touched_nodes
 from twin_core.side_by_side import both, side_by_side
 
@@ -91,7 +91,7 @@ def against_free_forms(
 def _repeatable(trial: Trial, options: Sequence[Trial], n_tried: int) -> Repeatable:
     """Return what the likeliest of some trials with a free form on top removes."""
     for top in _likeliest(trial, options):
-        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, trial.unexplained() - top.unexplained())
+        return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, explained(trial, top))
     return Repeatable()
 
 

@@ -15,7 +15,7 @@ from twin_core.discover.coincidence import coinciding_channel
 from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
-from twin_core.discover.trial import Trial, by_chance
+from twin_core.discover.trial import Trial, by_chance, explained
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
@@ -319,7 +319,7 @@ def _little(simple: Trial, trial: Trial, removed: float) -> float:
     """
     stays = trial.unexplained() - removed
     share = policy.REPEATABLE_SHARE
-    return min(share * (simple.unexplained() - trial.unexplained()), max(policy.MOST_COARSENESS, share * stays))
+    return min(share * explained(simple, trial), max(policy.MOST_COARSENESS, share * stays))
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:

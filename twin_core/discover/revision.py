@@ -24,7 +24,7 @@ from twin_core.discover.judge import (
     is_close,
     worth,
 )
-from twin_core.discover.trial import Trial, by_chance, mean_excess, try_effects
+from twin_core.discover.trial import Trial, by_chance, explained, mean_excess, try_effects
 from twin_core.effects.base import Effect
 from twin_core.side_by_side import side_by_side
 
@@ -185,11 +185,9 @@ def _explains_as_much(simple: Trial, named: Trial, heat: Trial) -> bool:
 
     What stays beside the heat is then visible and no more than coarseness, which leans towards whatever has more freedom.
     """
-    left = heat.unexplained()
-    if mean_excess(heat) <= by_chance(heat.n_samples) or left > policy.MOST_COARSENESS:
+    if mean_excess(heat) <= by_chance(heat.n_samples) or heat.unexplained() > policy.MOST_COARSENESS:
         return False
-    without = simple.unexplained()
-    return without - named.unexplained() >= (1.0 - policy.REPEATABLE_SHARE) * (without - left)
+    return explained(simple, named) >= (1.0 - policy.REPEATABLE_SHARE) * explained(simple, heat, named)
 
 
 def _is_better(name: Finding, heat: Finding) -> bool:

@@ -116,14 +116,6 @@ class Trial:
         return attempted(partial(with_gradients, problem, optimum, near), "gradients within nodes", [])
 
     @once
-    def likeliest(self) -> Calibration:
-        """The open-loop calibration, beside gradients within the nodes where the readings are likelier with them."""
-        calibration, gradients = self.calibration(), self.beside_gradients()
-        if gradients is None or gradients.log_posterior <= calibration.log_posterior:
-            return calibration
-        return Calibration(gradients.problem, gradients.optimum, gradients.whitener, calibration.max_step_s)
-
-    @once
     def along_trajectories(self) -> float:
         """ln of what the readings say where no undeclared heat acts: a misfit wanders at the sensors, beside gradients or not."""
         gradients = self.beside_gradients()
@@ -162,9 +154,28 @@ class Trial:
         return np.maximum(np.nan_to_num(square) - 1.0, 0.0)
 
     @once
+    def share_of_gradients(self) -> float:
+        """Share of what gradients within the nodes explain that is theirs: none where the readings are less likely beside them.
+
+        They are what a coarse network leaves. Where far more stays beside them, a finer network would not have followed the
+        readings either: most of what they explain something else may explain as well.
+        """
+        gradients = self.beside_gradients()
+        if gradients is None or gradients.log_posterior <= self.calibration().log_posterior:
+            return 0.0
+        return min(1.0, policy.MOST_COARSENESS / max(float(np.mean(self._excess(gradients.residuals))), 1e-300))
+
+    def left_beside(self, share: float) -> float:
+        """Return the mean of :attr:`excess` over sensors, less a share of what gradients within the nodes explain of it."""
+        gradients, left = self.beside_gradients(), mean_excess(self)
+        if gradients is None:
+            return left
+        return (1.0 - share) * left + share * float(np.mean(self._excess(gradients.residuals)))
+
+    @once
     def unexplained(self) -> float:
-        """The same for the likeliest open-loop calibration, mean over sensors."""
-        return float(np.mean(self._excess(self.likeliest().residuals)))
+        """The mean of :attr:`excess` over sensors, less what gradients within the nodes explain of it."""
+        return self.left_beside(self.share_of_gradients())
 
     @property
     def n_samples(self) -> int:
@@ -206,6 +217,15 @@ def by_chance(n_readings: int) -> float:
 def mean_excess(trial: Trial) -> float:
     """Return the variance of open-loop residuals beyond the sensors' noise, in units of that noise, mean over sensors."""
     return float(np.mean(trial.excess()))
+
+
+def explained(simple: Trial, rich: Trial, found: Trial | None = None) -> float:
+    """Return how much of what a simpler trial leaves a richer one explains, in units of the sensors' noise, mean over sensors.
+
+    Gradients within the nodes explain the same share of both: that of the richer one, or of another trial that was found.
+    """
+    share = (found or rich).share_of_gradients()
+    return simple.left_beside(share) - rich.left_beside(share)
 
 
 def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:

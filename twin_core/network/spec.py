@@ -437,6 +437,11 @@ class TwinSpec(Strict):
         """The used channels that no sensor reads: inputs and boundary temperatures."""
         return frozenset(self.used_channels) - frozenset(self.sensors)
 
+    @property
+    def held_inputs(self) -> frozenset[str]:
+        """The driving channels whose values hold from sample to sample."""
+        return frozenset(name for name in self.driving_channels if self.channels[name].is_held)
+
     def noise_std_K(self, sensor: str) -> float | None:
         """The declared noise of a sensor in kelvin (a difference: the same number in degC)."""
         return self.channels[sensor].noise_std

@@ -18,6 +18,8 @@ from twin_core.quality.quantisation import resolution
 from twin_core.quality.runs import runs_of
 
 _LEAST_WINDOW, _LARGEST_WINDOW = 8, 64
+LEAST_MOVING = 2
+"""Moving channels that are read in a frozen row: where it is one alone the channel may be frozen, and a command may rest."""
 _erf = np.frompyfunc(math.erf, 1, 1)  # a service that starts needs no SciPy
 
 
@@ -32,14 +34,12 @@ def frozen_rows(columns: Sequence[FloatArray]) -> BoolArray:
     n_times = columns[0].size if columns else 0
     found = np.zeros(n_times, dtype=np.bool_)
     moving = [column for column in columns if resolution(column) > 0.0]
-    if n_times < LEAST_READINGS or len(moving) < 2:
+    if n_times < LEAST_READINGS or len(moving) < LEAST_MOVING:
         return found
-    same, any_read = np.ones(n_times - 1, dtype=np.bool_), np.zeros(n_times - 1, dtype=np.bool_)
+    same = np.ones(n_times - 1, dtype=np.bool_)
     for column in columns:
-        absent = np.isnan(column[1:]) & np.isnan(column[:-1])
-        same &= (column[1:] == column[:-1]) | absent
-        any_read |= ~absent
-    same &= any_read
+        same &= (column[1:] == column[:-1]) | (np.isnan(column[1:]) & np.isnan(column[:-1]))
+    same &= np.sum([np.isfinite(column[1:]) for column in moving], axis=0) >= LEAST_MOVING
     first, stop = runs_of(same)
     stay = np.maximum(same.mean(), np.prod([_stay(column, first, stop) for column in moving], axis=0))
     _mark(found, first, stop, _unlikely(stop - first, stay, n_times))

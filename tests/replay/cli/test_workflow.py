@@ -119,7 +119,7 @@ def test_close_loop_leaves_its_three_files(desk: Path, capsys: pytest.CaptureFix
     assert "pair" in (out / "report.html").read_text()
     assert main([str(a) for a in arguments]) == 0  # once more into the folder that exists, for people
     printed = capsys.readouterr()
-    assert "the declared model suffices" in printed.out and printed.err == ""
+    assert "The declared model suffices" in printed.out and printed.err == ""
 
 
 def spoilt(text: str) -> str:

@@ -56,6 +56,15 @@ def test_frozen_rows_are_found_in_every_channel(seed: int, begin: int, lasting: 
         assert masks[name]["frozen"][begin + 1 : begin + 1 + lasting].all()
 
 
+@pytest.mark.parametrize("present", [(), ("T_a",)])
+def test_a_command_that_rests_while_temperatures_are_missing_is_a_reading(present: tuple[str, ...]) -> None:
+    columns = healthy(7)
+    columns["Q"] = np.where(np.arange(1200) < 600, np.random.default_rng(3).choice([0.0, 5.0, 9.0], 1200), 9.0)
+    for name in {"T_a", "T_b", "T_c"} - set(present):
+        columns[name][650:850] = np.nan
+    assert found(columns) == {}
+
+
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 2**32 - 1), begin=st.integers(100, 900), lasting=st.integers(45, 200))
 def test_one_frozen_channel_is_found_alone(seed: int, begin: int, lasting: int) -> None:
