@@ -13,7 +13,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.calibrate.covariance import is_open_ended, noise_of_fit, trajectory_covariance
 from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.multistart import best_of_starts
-from twin_core.calibrate.noise import sensor_noise_K
+from twin_core.calibrate.noise import noise_beside_K, sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener
@@ -177,6 +177,7 @@ def fit_network(
     coarse = coarse_problem(problem, step)
     search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples, deadline=deadline)
     problem = recentred(problem, search.best)
+    problem = with_noise_beside(problem, search.best.unknowns)
     on_trajectories = partial(minimise, problem, deadline=deadline)
 
     progress(0.4, "fitting in the presence of undeclared heat")
@@ -248,7 +249,8 @@ def fit_trajectories(
         deadline=deadline,
         progress=lambda share, message: progress(0.1 + 0.5 * share, message),
     )
-    best, problem = search.best, recentred(problem, search.best)
+    best = search.best
+    problem = with_noise_beside(recentred(problem, best), best.unknowns)
     progress(0.6, "fitting all samples")
     failures: list[str] = []
     fine = attempted(partial(approach, problem, best.unknowns, rounds=1, deadline=deadline), "refinement", failures)
@@ -271,6 +273,16 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
     parameters, found = problem.network.parameters, problem.values(optimum.unknowns)
     guessed = np.array([p.guessed for p in parameters.parameters])
     return problem.with_network(problem.network.with_values(np.where(guessed, found, parameters.values)))
+
+
+def with_noise_beside(problem: Problem, unknowns: FloatArray) -> Problem:
+    """Return the problem with the noise that is left of its readings beside a first fit, where that is far less."""
+    fit = problem.solve(unknowns)
+    if not np.isfinite(fit.cost):
+        return problem
+    records = [segment.record for segment in problem.segments]
+    left_K = problem.residuals(fit)
+    return replace(problem, noise_K=noise_beside_K(problem.network.spec, records, problem.noise_K, left_K))
 
 
 def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = (), afresh: bool = True) -> Calibration:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import record_of
-from twin_core.calibrate.noise import FALLBACK_STD_K, difference_noise_K, sensor_noise_K
+from twin_core.calibrate.noise import DYNAMICS, FALLBACK_STD_K, difference_noise_K, noise_beside_K, sensor_noise_K
 from twin_core.network.spec_io import load_spec
 from twin_core.quality.quantisation import quantum
 
@@ -113,3 +113,32 @@ def test_a_sensor_that_hardly_moves_shows_its_resolution_at_most() -> None:
     """A whole kelvin from code to code, crossed three times: readings are good to 1 / sqrt 12 of it, not to nothing."""
     assert readings(np.repeat([333.0, 334.0, 335.0, 336.0], 12)) == pytest.approx(1.0 / np.sqrt(12.0))
     assert readings(np.full(50, 290.0)) == FALLBACK_STD_K
+
+
+@pytest.mark.parametrize(
+    ("period", "declared", "told_K"),
+    [(9.0, None, 0.1), (400.0, None, None), (9.0, 0.5, None)],
+    ids=["turns between samples", "slow", "declared"],
+)
+def test_what_a_model_follows_is_no_noise(period: float, declared: float | None, told_K: float | None) -> None:
+    """Samples 30 s apart of a board that warms in two minutes told seven times its noise, and any misfit stayed below that."""
+    rng = np.random.default_rng(5)
+    spec = load_spec(
+        {
+            "twin": "board",
+            "channels": {"T": {"kind": "temperature", "unit": "K"} | ({"noise_std": declared} if declared else {})},
+            "nodes": [{"id": "a", "sensor": "T", "capacity_J_per_K": {"guess": 5.0}}],
+        }
+    )
+    at = np.arange(600.0)
+    truth_K, noise_K = 300.0 + 5.0 * np.sin(2.0 * np.pi * at / period), rng.normal(0.0, 0.1, at.size)
+    record = record_of(30.0 * at, T=truth_K + noise_K)
+    before_K = sensor_noise_K(spec, [record])
+    after_K = noise_beside_K(spec, [record], before_K, [noise_K[:, None]])
+    if told_K is None:
+        np.testing.assert_array_equal(after_K, before_K)
+    else:
+        assert before_K[0] > 5.0 * DYNAMICS * told_K
+        np.testing.assert_allclose(after_K, told_K, rtol=0.15)
+        # Not what a poor model follows no better than the differences did.
+        np.testing.assert_array_equal(noise_beside_K(spec, [record], before_K, [record.values["T"][:, None]]), before_K)
