@@ -215,7 +215,7 @@ def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -
 
 
 def print_report(report: dict[str, Any]) -> None:
-    """Print the verdict, the findings and the held-out error before and after."""
+    """Print the verdict, the findings, the held-out error before and after, and what the data cannot tell."""
     from replay.cli.console import print_line, print_table, short
     from twin_core.report.phrasing import headline, sentence
 
@@ -230,6 +230,8 @@ def print_report(report: dict[str, Any]) -> None:
     for sensor, scores in before["per_sensor"].items():
         rows.append([sensor, short(scores["rmse_K"]), short(after["per_sensor"][sensor]["rmse_K"])])
     print_table("held-out rmse", ["sensor", "before K", "after K"], rows)
+    for words in report["words"]:
+        print_line(words)
 
 
 def describe(finding: dict[str, Any]) -> str:
