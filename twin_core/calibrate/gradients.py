@@ -27,6 +27,9 @@ BIOT = 0.1
 """Standard deviation of every b_l before anything is measured, a Biot number; ``python -m benchmarks.gradients`` prints what they
 explain at half, at double and without."""
 
+LEAST_STEPS = 2
+"""Steps before which the linearised model is not believed to foretell how much stays: from a plain fit it tells six times it."""
+
 MOST_STEPS, MOST_STEPS_NEAR = 30, 10
 SETTLED_SHARE = 1e-3
 """The fit ends where a step lowers the cost by no more, or after so many, fewer where it starts near another one: a limit of
@@ -77,7 +80,9 @@ class _Point:
     cost: float
 
 
-def with_gradients(problem: Problem, optimum: Optimum, near: FloatArray | None = None) -> WithGradients:
+def with_gradients(
+    problem: Problem, optimum: Optimum, near: FloatArray | None = None, most_left: float = np.inf
+) -> WithGradients | None:
     """Fit gradients within the nodes beside all unknowns, from an open-loop optimum.
 
     Parameters
@@ -86,6 +91,13 @@ def with_gradients(problem: Problem, optimum: Optimum, near: FloatArray | None =
         A network fitted to open-loop trajectories; heat flows are those along its trajectories.
     near : (n_unknowns,)
         Where such a fit of a simpler network has ended: the better start counts.
+    most_left
+        Variance beyond the sensors' noise, in units of that noise, that may stay.
+
+    Returns
+    -------
+    WithGradients, or None
+        None where more would stay, as the linearised model foretells after some steps: gradients are not what is missing then.
 
     Raises
     ------
@@ -104,9 +116,12 @@ def with_gradients(problem: Problem, optimum: Optimum, near: FloatArray | None =
     here, damping = at(optimum.unknowns, optimum.fit), LEAST_DAMPING
     if near is not None and np.isfinite((fit := problem.solve(near, near=optimum.fit)).cost):
         here = min(here, at(near, fit), key=lambda point: point.cost)
-    for _ in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
+    enough = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum())
+    for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here, flows_K, of_sensor)
+        if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ _solved(hessian, gradient)) > enough:
+            return None
         while damping < MOST_DAMPING:
             step = _solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
             fit = problem.solve(here.unknowns + step, near=here.fit)

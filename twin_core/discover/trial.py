@@ -33,6 +33,11 @@ SHORTER_SHARES = (0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Shares of an effect's amplitude for the second start: the first that loses nothing, or the last. Screening takes an amplitude
 to which the other parameters give way; where a fit starts they have not yet."""
 
+FAR_MORE = 4.0
+"""Gradients within nodes are fitted where no more would stay beside them than so many times what a coarse network may leave, a
+misfit of four noises; a limit of time: a quarter of what they explain would be theirs, and heat that wanders describes such
+readings better."""
+
 MOST_ROUNDS = 8
 """So often a fit is taken up again until it has converged, a limit of time: declared records took two rounds at most."""
 
@@ -102,8 +107,8 @@ class Trial:
     def beside_gradients(self) -> WithGradients | None:
         """Trajectories fitted beside temperature gradients within the nodes, which no lumped network describes.
 
-        None where trajectories leave no more than chance, so that gradients have nothing to explain, and where their
-        arithmetic fails.
+        None where trajectories leave no more than chance, so that gradients have nothing to explain, where far more would
+        stay beside them than any coarse network leaves, and where their arithmetic fails.
         """
         calibration = self.calibration()
         if self.excess().mean() <= by_chance(self.n_samples):
@@ -113,7 +118,8 @@ class Trial:
         if below is not None:
             own = problem.network.parameters.at_free(optimum.unknowns[: problem.n_free]).as_dict()
             near = carried_over(below.problem, below.optimum.unknowns, problem, own)
-        return attempted(partial(with_gradients, problem, optimum, near), "gradients within nodes", [])
+        work = partial(with_gradients, problem, optimum, near, FAR_MORE * policy.MOST_COARSENESS)
+        return attempted(work, "gradients within nodes", [])
 
     @once
     def along_trajectories(self) -> float:

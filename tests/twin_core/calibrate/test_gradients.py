@@ -149,3 +149,16 @@ def test_a_sensor_that_lags_reads_its_gradients_late() -> None:
     for late, flow in zip(with_lag[0].T, now[0].T, strict=False):
         assert late == pytest.approx(lsim(states, flow, time_s, X0=flow[0])[1], abs=1e-3)
     assert with_lag[1] == pytest.approx(now[1], abs=1e-9)
+
+
+def test_gradients_that_would_leave_too_much_are_not_fitted() -> None:
+    """Noise alone of a body that has them; three times the noise, which is nine of its variances, of one that reads so."""
+    calibration = fitted(1.0)
+    problem, optimum = calibration.problem, calibration.optimum
+    assert with_gradients(problem, optimum, most_left=0.2) is not None
+    rng = np.random.default_rng(8)
+    strange = [replace(s, measured_K=s.measured_K + rng.normal(0.0, 3.0 * NOISE_K, (400, 2))) for s in problem.segments]
+    spoilt = replace(problem, segments=tuple(strange))
+    at = replace(optimum, fit=spoilt.solve(optimum.unknowns))
+    assert with_gradients(spoilt, at, most_left=8.0) is None
+    assert with_gradients(spoilt, at, most_left=10.0) is not None
