@@ -25,7 +25,8 @@ from benchmarks.network_cases import network_case
 from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.holdout import predict, split_burn_in
 from twin_core.network.screened import screened
-from twin_core.telemetry import Record, cut_at_gaps
+from twin_core.quality.gaps import segmented
+from twin_core.telemetry import Record
 
 GRACE_S = 60.0
 """A run that goes on so long after its deadline hangs, and is ended."""
@@ -178,7 +179,7 @@ def _rmse_K(errors: Sequence[np.ndarray[Any, Any]]) -> float:
 def _pair(loop: ClosedLoop, prepared: Prepared, record: Record) -> Pair:
     """Return the held-out errors of one record of the hold-out."""
     try:
-        parts = cut_at_gaps([screened(prepared.spec, record)], prepared.spec.driving_channels)
+        parts = segmented([screened(prepared.spec, record)], prepared.spec.driving_channels, prepared.spec.held_inputs)
         held = [split_burn_in(part, prepared.burn_in_s) for part in parts]
         errors = [
             _rmse_K([done.measured_K - done.predicted_K for done in (predict(model, h) for h in held)])

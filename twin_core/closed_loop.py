@@ -27,12 +27,12 @@ from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
-from twin_core.quality.gaps import cut_where_inputs_are_unknown
+from twin_core.quality.gaps import segmented
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
 from twin_core.report.mistakes import told_mistakes
 from twin_core.report.plots import build_plots
-from twin_core.telemetry import Record, cut_at_gaps
+from twin_core.telemetry import Record
 
 AFTERWARDS = 0.1
 """Share of the deadline that smoothing the missing heat may take beyond it."""
@@ -117,7 +117,6 @@ def close_loop(
         records = [screened(spec, record) for record in records]
         holdout_records = [screened(spec, record) for record in holdout_records or ()]
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
-        train = cut_where_inputs_are_unknown(train, spec.held_inputs)
         check_moments(train, moments)
         fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
         before = to_model(calibration, ())
@@ -219,9 +218,9 @@ def _split(
     """Return the training records and the hold-out; TelemetryError where there is nothing to score."""
     if not records:
         raise TelemetryError("no telemetry given")
-    records = cut_at_gaps(records, spec.driving_channels)
+    records = segmented(records, spec.driving_channels, spec.held_inputs)
     if holdout_records:
-        separate = cut_at_gaps(holdout_records, spec.driving_channels)
+        separate = segmented(holdout_records, spec.driving_channels, spec.held_inputs)
         train, held = list(records), [split_burn_in(record, burn_in_s) for record in separate]
     else:
         train, held = split_fraction(records, 0.3 if holdout is None else holdout)

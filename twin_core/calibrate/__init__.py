@@ -9,8 +9,8 @@ from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
 from twin_core.network.spec import TwinSpec
-from twin_core.quality.gaps import cut_where_inputs_are_unknown
-from twin_core.telemetry import Record, cut_at_gaps
+from twin_core.quality.gaps import segmented
+from twin_core.telemetry import Record
 
 METHODS = ("second-order", "neural-ode")
 LOSSES = ("squared", "huber")
@@ -66,7 +66,7 @@ def calibrate(
         raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
     if training and method != "neural-ode":
         raise ModelError(f"{next(iter(training))} belongs to method 'neural-ode'")
-    records = cut_where_inputs_are_unknown(cut_at_gaps(records, spec.driving_channels), spec.held_inputs)
+    records = segmented(records, spec.driving_channels, spec.held_inputs)
     if method == "neural-ode":
         model = _by_neural_ode(spec, records, loss, dict(training or {}), progress)
     else:

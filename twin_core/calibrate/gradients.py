@@ -28,7 +28,8 @@ BIOT = 0.1
 explain at half, at double and without."""
 
 LEAST_STEPS = 2
-"""Steps before which the linearised model is not believed to foretell how much stays: from a plain fit it tells six times it."""
+"""Steps before which the linearised model is not asked how much will stay: at the plain fit of a body with gradients it foretold
+six times what stayed in the end."""
 
 MOST_STEPS, MOST_STEPS_NEAR = 30, 10
 SETTLED_SHARE = 1e-3

@@ -16,7 +16,8 @@ FALLBACK_STD_K, LEAST_STD_K = 0.1, 1e-4
 
 DYNAMICS = 1.5
 """Ratio of the noise that readings tell to that of what a model leaves of them, beyond which the former holds more than noise.
-Both are within 10 % of each other on rigs, houses and spacecraft whose temperatures are sampled well."""
+On ten splits of rigs, houses and spacecraft the latter is 0.87 to 1.28 of the former, quantisation aside; on none of 50 seeded
+spacecraft it is below two thirds. 30 s apart on a board that warms in two minutes it is a sixth."""
 
 
 UNEVEN = 0.05

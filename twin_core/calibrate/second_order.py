@@ -277,8 +277,8 @@ def recentred(problem: Problem, optimum: Optimum) -> Problem:
 
 def with_noise_beside(problem: Problem, unknowns: FloatArray) -> Problem:
     """Return the problem with the noise that is left of its readings beside a first fit, where that is far less."""
-    fit = problem.solve(unknowns)
-    if not np.isfinite(fit.cost):
+    fit = attempted(partial(problem.solve, unknowns), "noise beside a first fit", [])
+    if fit is None or not np.isfinite(fit.cost):
         return problem
     records = [segment.record for segment in problem.segments]
     left_K = problem.residuals(fit)

@@ -111,8 +111,7 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
 
 
 def _explaining(simple: Trial, start: Calibration, effect: Effect, found: Trial, least: float) -> Trial | None:
-    """Return an effect on top of a trial, fitted on trajectories, if it explains at least so much of the misfit as it is with
-    what was found."""
+    """Return an effect on top of a trial, fitted on trajectories, if it explains so much, gradients as with what was found."""
     trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
     return None if trial is None or explained(simple, trial, found) < least else trial
 

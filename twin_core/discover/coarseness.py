@@ -45,12 +45,12 @@ def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = Tr
     is_named
         Whether names were added: a heat without a name has no less to explain.
     """
-    told_by = explained(simple, rich)
+    amount = explained(simple, rich)
     alone = is_named and not simple.effects
     told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
     if told is not None:
         asked *= min(1.0, policy.DOMINANCE * told**2)
-    return told_by / asked if asked > 0.0 else np.inf
+    return amount / asked if asked > 0.0 else np.inf
 
 
 def stands(simple: Trial, rich: Trial) -> bool:

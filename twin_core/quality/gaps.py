@@ -1,12 +1,13 @@
 """Gaps in which an input went its own way: what was held across one is not what the spacecraft was given."""
 
 from collections.abc import Collection, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
 
 from twin_core._typing import FloatArray
-from twin_core.telemetry import LEAST_PART, Record
+from twin_core.telemetry import LEAST_PART, Record, cut_at_gaps
 
 SHORTEST_GAP = 10.0
 """Usual intervals up to which a held value bridges what is missing, whatever it is: a few lost rows end no record."""
@@ -15,7 +16,8 @@ UNKNOWN_SHARE = 0.5
 """Share of an input's variance that its change across a gap has from which it is not known there: at half of it the value before
 the gap and the mean over the record tell as much."""
 
-N_LAGS = 12
+N_LAGS = 24
+"""Lags at which the variogram is told, from one sample to half the record, each a little longer than the one before."""
 
 
 def cut_where_inputs_are_unknown(records: Sequence[Record], inputs: Collection[str]) -> list[Record]:
@@ -38,18 +40,32 @@ def cut_where_inputs_are_unknown(records: Sequence[Record], inputs: Collection[s
     return [part for record in records for part in _cut(record, sorted(inputs & record.values.keys()))]
 
 
+def segmented(records: Sequence[Record], driving: AbstractSet[str], held: Collection[str]) -> list[Record]:
+    """Return records cut at every gap that no fit or prediction is to step through: :func:`cut_at_gaps`, and the above.
+
+    Parameters
+    ----------
+    records
+        Segments of telemetry.
+    driving, held
+        Channels that drive the model, and those of them that hold from sample to sample.
+    """
+    return cut_where_inputs_are_unknown(cut_at_gaps(records, driving), held)
+
+
 def _cut(record: Record, inputs: Sequence[str]) -> list[Record]:
     n_times = record.time_s.size
     if n_times < 2 * LEAST_PART:
         return [record]
     intervals_s = np.diff(record.time_s)
     usual_s = float(np.median(intervals_s))
+    gaps = np.flatnonzero(intervals_s > SHORTEST_GAP * usual_s).tolist()
+    known_s = {name: usual_s * _known_for(record.values[name]) for name in inputs} if gaps else {}
     starts, notices = [0], [record.notices]
-    for last in np.flatnonzero(intervals_s > SHORTEST_GAP * usual_s).tolist():
+    for last in gaps:
         if last + 1 - starts[-1] < LEAST_PART or n_times - last - 1 < LEAST_PART:
             continue
-        steps = float(intervals_s[last] / usual_s)
-        unknown = [name for name in inputs if _changes_within(record.values[name], steps)]
+        unknown = [name for name, span_s in known_s.items() if intervals_s[last] >= span_s]
         if unknown:
             starts.append(last + 1)
             notices.append((_notice(record, last, unknown),))
@@ -57,16 +73,18 @@ def _cut(record: Record, inputs: Sequence[str]) -> list[Record]:
     return [replace(part, notices=own) for part, own in zip(parts, notices, strict=True)]
 
 
-def _changes_within(column: FloatArray, steps: float) -> bool:
-    """Return whether an input changes so much within a gap of so many usual intervals, as its variogram tells."""
-    variance = float(np.nanvar(column)) if np.isfinite(column).any() else 0.0
-    if variance == 0.0:
-        return False
-    lags = np.unique(np.geomspace(1.0, np.clip(steps, 1.0, column.size / 2), N_LAGS).astype(np.int64)).tolist()
-    apart = [change[np.isfinite(change)] for change in (column[lag:] - column[:-lag] for lag in lags)]
-    return max((0.5 * float(np.mean(change**2)) for change in apart if change.size), default=0.0) >= (
-        UNKNOWN_SHARE * variance
-    )
+def _known_for(column: FloatArray) -> float:
+    """Return for how many usual intervals the value of an input is known once it was read, by its variogram; inf if for good."""
+    seen = column[np.isfinite(column)]
+    variance = float(np.var(seen)) if seen.size else 0.0
+    for lag in (
+        np.unique(np.geomspace(1.0, column.size / 2, N_LAGS).astype(np.int64)).tolist() if variance > 0.0 else ()
+    ):
+        change = column[lag:] - column[:-lag]
+        change = change[np.isfinite(change)]
+        if change.size and 0.5 * float(np.mean(change**2)) >= UNKNOWN_SHARE * variance:
+            return float(lag)
+    return np.inf
 
 
 def _notice(record: Record, last: int, unknown: Sequence[str]) -> str:
