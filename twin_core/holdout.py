@@ -43,7 +43,7 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
     Parameters
     ----------
     records
-        Segments in order; several segments are split by their summed spans.
+        Segments in order; several segments are split by their summed spans. One of which a part would be too short stays whole.
     fraction
         Between 0 and 1, exclusive.
 
@@ -66,9 +66,10 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
     for record, span in zip(records, spans, strict=True):
         cut = float(record.time_s[0]) + min(max(kept, 0.0), span)
         before = record.time_s <= cut + 1e-9
-        if kept >= span:
+        too_short = before.sum() < MIN_BURN_IN_SAMPLES, (~before).sum() < MIN_HELD_SAMPLES
+        if kept >= span or (too_short[1] and record is not records[-1]):
             train.append(record)
-        elif kept <= 0.0:
+        elif kept <= 0.0 or (too_short[0] and train):
             held.append(split_burn_in(record, None))
         else:
             _check_parts(record.name, fraction, int(before.sum()), int((~before).sum()))

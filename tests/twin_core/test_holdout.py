@@ -55,6 +55,18 @@ def test_a_cut_between_segments_leaves_both_whole() -> None:
     assert held[0].scored.time_s[-1] == 1e6 + 60 * 60.0
 
 
+@pytest.mark.parametrize(("fraction", "n_train"), [(0.61, 1), (0.65, 1), (0.52, 1), (0.4, 2), (0.25, 2)])
+def test_a_segment_is_not_cut_where_a_part_would_be_too_short(fraction: float, n_train: int) -> None:
+    """Passes over a station: 30 readings each, of which a few would tell no start, or nothing."""
+    passes = [steady(30, 1e6 * i, str(i)) for i in range(3)]
+    if fraction == 0.52:  # before the last readings of the first one end
+        passes = [steady(30, 0.0, "0"), steady(31, 1e6, "1")]
+    train, held = split_fraction(passes, fraction)
+    assert len(train) == n_train and held
+    assert all(part.time_s.size >= 10 for part in train)
+    assert all(part.scored.time_s.size >= 3 for part in held)
+
+
 @pytest.mark.parametrize("fraction", [0.0, 1.0, -0.1, 1.5, np.nan])
 def test_a_share_out_of_range_is_refused(fraction: float) -> None:
     with pytest.raises(TelemetryError, match="holdout: must be between 0 and 1"):

@@ -67,6 +67,14 @@ def test_parts_are_told_where_they_begin() -> None:
     assert "8940.0 to 12600.0" in notice and "Q changes faster" in notice
 
 
+def test_a_record_of_many_gaps_is_looked_at_once() -> None:
+    """The variogram of an input is told once, not for each of its gaps."""
+    at = np.arange(200_000)
+    record = record_of(STEP_S * at, Q=np.where(at % 7 < 3, 20.0, 0.0)).take(at % 60 < 40)
+    parts = cut_where_inputs_are_unknown([record], {"Q"})
+    assert len(parts) == 3334 and sum(part.time_s.size for part in parts) == record.time_s.size
+
+
 def heated(lasting: int) -> Record:
     """Return a node of 3000 J/K that loses 2 W/K to 280 K under a switched heater, without the rows of a gap."""
     decay, temperature_K = np.exp(-2.0 * STEP_S / 3000.0), np.empty(400)
