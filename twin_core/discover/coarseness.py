@@ -28,26 +28,26 @@ def least_explained(beside: float, left: float, n_readings: int, *, is_named: bo
     return policy.DOMINANCE * (min(coarseness, policy.MOST_COARSENESS) if is_named else coarseness)
 
 
-def times_asked(simple: Trial, rich: Trial, asked: float, *, is_named: bool = True) -> float:
-    """Return how many times as much as is asked of them names explain; those that foretell have less to explain.
+def times_asked(simple: Trial, rich: Trial, asked: float, shown: tuple[Trial, Trial] | None = None) -> float:
+    """Return how many times as much as is asked of them effects explain; names that foretell have less to explain.
 
     Coarseness is explained where it was seen; what is really there is foretold. Names that leave less of the variance of the
     error on what they were not fitted to than coarseness could, half of it for a dominance of two, have so much less to
-    explain. Only where nothing else is named: what a name leaves beside it is foretold by others. What cannot be computed is
-    not foretold.
+    explain. They must foretell it with nothing else named: what a name leaves beside it is foretold by others. What cannot be
+    computed is not foretold.
 
     Parameters
     ----------
     simple, rich
-        Trials without the names and with them.
+        Trials without the effects and with them.
     asked
         Variance that they must explain, in units of the sensors' noise.
-    is_named
-        Whether names were added: a heat without a name has no less to explain.
+    shown
+        Trials without any finding and with these names alone; None where what they foretell does not count, as that of a heat
+        without a name.
     """
     amount = explained(simple, rich)
-    alone = is_named and not simple.effects
-    told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", []) if alone else None
+    told = attempted(lambda: validate(*shown).foresight, "what names foretell", []) if shown is not None else None
     if told is not None:
         asked *= min(1.0, policy.DOMINANCE * told**2)
     return amount / asked if asked > 0.0 else np.inf
@@ -58,4 +58,5 @@ def stands(simple: Trial, rich: Trial) -> bool:
     left, n_readings = mean_excess(rich), rich.n_samples
     if left <= by_chance(n_readings):
         return True
-    return times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings)) >= 1.0
+    shown = None if simple.effects else (simple, rich)
+    return times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings), shown) >= 1.0

@@ -54,7 +54,7 @@ def withdraw(state: Search, needed: float) -> None:
             asked[places] = least_explained(state.trial.unexplained(), left, n_readings, is_named=places in named)
         without = _without_each(state, asked)
         told = {
-            places: times_asked(kept[0], state.trial, asked[places], is_named=places in named)
+            places: times_asked(kept[0], state.trial, asked[places], _alone(state, places) if places in named else None)
             for places, kept in without.items()
             if kept
         }
@@ -72,6 +72,15 @@ def withdraw(state: Search, needed: float) -> None:
         _drop(state, weakest, *kept)
         for rest in filter(None, rests):
             _examine_again(state, rest, needed)
+
+
+def _alone(state: Search, places: frozenset[object]) -> tuple[Trial, Trial] | None:
+    """Return the trials without any finding and with the effects at places alone; None where these cannot be computed."""
+    others = frozenset(effect.place for finding in state.findings for effect in finding.effects) - places
+    if not others:
+        return state.base, state.trial
+    kept = _attempted_without(state, others)
+    return None if kept is None else (state.base, kept[0])
 
 
 def _examine_again(state: Search, places: Collection[object], needed: float, *, foresight: float = -np.inf) -> None:

@@ -1,12 +1,13 @@
 """What nodes store: capacity and enthalpy as functions of temperature, and temperature as a function of enthalpy."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.network.model import Network
-from twin_core.network.terms import Entry
+from twin_core.network.terms import CapacityTerm, Entry
 
 TOLERANCE_K = 1e-11
 ROUNDING = 8.0 * np.finfo(np.float64).eps
@@ -76,28 +77,52 @@ def to_temperatures_K(
     u grows with T, so there is one, or the limit beyond which it lies: Newton's method from ``near_K``, within a bracket that
     is halved where the capacity bends too sharply for it, for the points that are not found yet.
     """
-    if not network.capacities:
-        return enthalpy_K
-    ends_K = np.broadcast_to(np.array(limit_K)[:, None], (2, enthalpy_K.shape[-1]))
-    least, most = store(network, values, ends_K).enthalpy_K
-    wanted = np.clip(enthalpy_K, least, most).reshape(-1, least.size)
-    now = np.clip(near_K, *limit_K).reshape(wanted.shape)
-    now = np.where(wanted == least, limit_K[0], np.where(wanted == most, limit_K[1], now))
+    found_K = np.clip(enthalpy_K, *limit_K)
+    for node in {term.node for term in network.capacities}:
+        terms = [(term, values[network.term_index(term)]) for term in network.capacities if term.node == node]
+        near = np.clip(near_K[..., node], *limit_K).ravel()
+        own = float(values[network.capacity_index[node]])
+        found_K[..., node] = _inverted(terms, own, enthalpy_K[..., node].ravel(), near, limit_K).reshape(
+            near_K.shape[:-1]
+        )
+    return found_K
+
+
+def _inverted(
+    terms: Sequence[tuple[CapacityTerm, FloatArray]],
+    own_J_per_K: float,
+    enthalpy_K: FloatArray,
+    near_K: FloatArray,
+    limit_K: tuple[float, float],
+) -> FloatArray:
+    """Return the temperatures (n_points,) at which one node with these terms and their values has enthalpies (n_points,)."""
+
+    def at(temperature_K: FloatArray) -> tuple[FloatArray, FloatArray]:
+        enthalpy, capacity = temperature_K, np.ones_like(temperature_K)
+        for term, value in terms:
+            part = term.evaluate(temperature_K, value)
+            enthalpy = enthalpy + part.stored_J / own_J_per_K
+            capacity = capacity + part.extra_J_per_K / own_J_per_K
+        return enthalpy, capacity
+
+    least, most = at(np.array(limit_K))[0]
+    wanted = np.clip(enthalpy_K, least, most)
+    now = np.where(wanted == least, limit_K[0], np.where(wanted == most, limit_K[1], near_K))
     low, high = np.full_like(wanted, limit_K[0]), np.full_like(wanted, limit_K[1])
     miss_before = np.full_like(wanted, np.inf)
-    found, rows = now.copy(), np.arange(now.shape[0])
+    found, points = now.copy(), np.arange(now.size)
     for _ in range(N_ITERATIONS):
-        at = store(network, values, now)
-        miss = at.enthalpy_K - wanted
+        enthalpy, capacity = at(now)
+        miss = enthalpy - wanted
+        size = np.abs(miss)
         low, high = np.where(miss < 0.0, now, low), np.where(miss > 0.0, now, high)
-        newton = now - miss * at.slope
-        slow = (np.abs(miss) > 0.5 * miss_before) | (newton < low) | (newton > high)
-        following = np.where(slow & (np.abs(miss) > TOLERANCE_K), 0.5 * (low + high), newton)
-        found[rows] = following
-        told = (np.abs(following - now) < TOLERANCE_K) | (np.abs(miss) < ROUNDING * (np.abs(now) + np.abs(wanted)))
-        goes_on = ~told.all(axis=1)
+        newton = now - miss / capacity
+        slow = ((size > 0.5 * miss_before) | (newton < low) | (newton > high)) & (size > TOLERANCE_K)
+        following = np.where(slow, 0.5 * (low + high), newton)
+        found[points] = following
+        goes_on = (np.abs(following - now) >= TOLERANCE_K) & (size >= ROUNDING * (np.abs(now) + np.abs(wanted)))
         if not goes_on.any():
             break
         now, wanted, low, high = (a[goes_on] for a in (following, wanted, low, high))
-        rows, miss_before = rows[goes_on], np.abs(miss)[goes_on]
-    return np.clip(found, *limit_K).reshape(enthalpy_K.shape)
+        points, miss_before = points[goes_on], size[goes_on]
+    return np.clip(found, *limit_K)

@@ -219,7 +219,8 @@ def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch
         raise np.linalg.LinAlgError
 
     monkeypatch.setattr(coarseness, "validate", fails)
-    assert coarseness.times_asked(stub(left=9.0), stub(load("n0"), left=3.0), 4.0) == 1.5
+    simple, rich = stub(left=9.0), stub(load("n0"), left=3.0)
+    assert coarseness.times_asked(simple, rich, 4.0, shown=(simple, rich)) == 1.5
 
 
 SCORE = score_needed(NEEDED)

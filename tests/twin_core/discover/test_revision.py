@@ -67,6 +67,25 @@ def test_what_foretells_has_less_to_explain(monkeypatch: pytest.MonkeyPatch, for
     assert not stands(beside, stub(load("n1"), load("n0"), left=0.5, foresight=foresight))
 
 
+@pytest.mark.parametrize(("foresight", "kept"), [(1.0, ["n1"]), (0.2, ["n0"])])
+def test_what_a_name_foretells_by_itself_counts_beside_others_too(
+    monkeypatch: pytest.MonkeyPatch, foresight: float, kept: list[str]
+) -> None:
+    """A sensor's lag that gradients beside a step resemble, say, foretells the other blocks by itself; the step does not."""
+    left = {"": 9.0, "n0": 0.5 + DOMINANCE * LEAST - JUST, "n1": 0.5 + DOMINANCE * LEAST - 2.0 * JUST, "n0 n1": 0.5}
+
+    def refitted(effects: tuple[Effect, ...]) -> Trial:
+        name = " ".join(sorted(e.where["node"] for e in effects))
+        return stub(*effects, left=left[name], foresight=foresight if name == "n0" else 1.0)
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    state = Search(refitted((load("n0"), load("n1"))), refitted(()))
+    state.findings = [Finding(judged("n0", 50.0)), Finding(judged("n1", 40.0))]
+    withdraw(state, NEEDED)
+    assert [f.effects[0].where["node"] for f in state.findings] == kept
+
+
 @pytest.mark.parametrize(
     ("explained", "left", "kept"),
     [
