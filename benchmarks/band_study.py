@@ -19,7 +19,7 @@ from benchmarks.hidden_effects import HIDDEN
 from benchmarks.loop import known_effect_trial, run_all
 from benchmarks.loop_cases import Task
 from benchmarks.markdown import markdown_table, save_table
-from twin_core.calibrate.second_order import to_model
+from twin_core.calibrate.summary import to_model
 from twin_core.closed_loop import centred
 from twin_core.report.build import parameters_json
 

@@ -20,7 +20,8 @@ from benchmarks.bands import Row
 from benchmarks.case import Case
 from benchmarks.loop_cases import FIRST_SEED, GROUPS, N_CLEAN, N_NETWORKS, Task, suite
 from benchmarks.loop_table import save_tables
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.closed_loop import close_loop
 from twin_core.discover.screen import screen, survey_of
 from twin_core.discover.shortlist import refined

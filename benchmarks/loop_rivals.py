@@ -21,7 +21,8 @@ from benchmarks.loop_cases import Task, suite
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.rival_bic import greedy_bic
 from benchmarks.rival_residual import IN_LIBRARY, Regressed, residual_polynomial, rms_error_K, sindy
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.closed_loop import close_loop
 from twin_core.discover.trial import Trial
 from twin_core.holdout import split_fraction

@@ -5,7 +5,8 @@ import numpy as np
 from benchmarks.markdown import markdown_table
 from benchmarks.paper_a_cases import noisy, simulations, training
 from twin_core.calibrate.identifiability import IDENTIFIED_STD
-from twin_core.calibrate.second_order import fit_trajectories, to_model
+from twin_core.calibrate.second_order import fit_trajectories
+from twin_core.calibrate.summary import to_model
 from twin_core.fem.paper import paper_spec
 
 N_RUNS, NOISE = 10, 0.01

@@ -7,7 +7,7 @@ places are refitted at every step, and four effects are the most.
 import numpy as np
 
 from benchmarks.rival_residual import Regressed
-from twin_core.calibrate.second_order import to_model
+from twin_core.calibrate.summary import to_model
 from twin_core.discover.shortlist import best_of_each_place, screened
 from twin_core.discover.trial import Trial, try_on_trajectories
 

@@ -21,8 +21,9 @@ from benchmarks.rival_features import Feature, FeatureHeat, constant, library, p
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.residual_noise import fit_whitener
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import Calibration, to_model
+from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.starting import channel_levels
+from twin_core.calibrate.summary import to_model
 from twin_core.effects import REGISTRY
 from twin_core.errors import TwinError
 from twin_core.holdout import HeldOut, predict, split_fraction

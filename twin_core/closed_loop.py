@@ -11,7 +11,8 @@ from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE, attempted
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.judge import NO_MODEL, Search

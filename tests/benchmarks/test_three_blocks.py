@@ -11,7 +11,8 @@ import pytest
 import yaml
 
 from twin_core.assimilate import assimilate
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.effects import REGISTRY, Effect
 from twin_core.network.spec_io import load_spec
 from twin_core.simulate.forcing import build_forcing

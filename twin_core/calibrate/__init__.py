@@ -92,7 +92,7 @@ def _by_neural_ode(
             f"method 'neural-ode' needs {error.name}, which is not installed: pip install torch torchdiffeq "
             "(README: how to get the small build)"
         ) from error
-    from twin_core.calibrate.second_order import to_model
+    from twin_core.calibrate.summary import to_model
 
     trained, calibration = fit_neural_ode(spec, records, recipe_of(training), progress=progress)
     return to_model(calibration, (), trained.notices, uncertain=False)

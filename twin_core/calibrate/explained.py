@@ -10,8 +10,9 @@ from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import Calibration, Loss, fit_trajectories, stated_guesses, to_model
+from twin_core.calibrate.second_order import Calibration, Loss, fit_trajectories
 from twin_core.calibrate.starting import table_levels
+from twin_core.calibrate.summary import stated_guesses, to_model
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.errors import NoSolutionError
 from twin_core.network.model import build_network

@@ -9,22 +9,16 @@ from twin_core._typing import FloatArray, Json, Progress, no_progress
 from twin_core.calibrate.approach import misfit_K
 from twin_core.calibrate.choice import by_sensitivity
 from twin_core.calibrate.containment import NO_DEADLINE
+from twin_core.calibrate.criteria import acceptance, with_met
 from twin_core.calibrate.explained import explained
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import (
-    READINGS_PER_UNKNOWN,
-    Calibration,
-    Loss,
-    acceptance,
-    fit_trajectories,
-    to_model,
-    with_met,
-)
+from twin_core.calibrate.second_order import READINGS_PER_UNKNOWN, Calibration, Loss, fit_trajectories
 from twin_core.calibrate.starting import table_levels
 from twin_core.calibrate.statistics import score, spread_of
+from twin_core.calibrate.summary import to_model
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.calibrated import with_values
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries

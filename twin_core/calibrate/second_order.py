@@ -7,20 +7,15 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from twin_core._typing import FloatArray, Json, Progress, no_progress
+from twin_core._typing import FloatArray, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
 from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
-from twin_core.calibrate.covariance import is_open_ended, noise_of_fit, trajectory_covariance
-from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
 from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.noise import noise_beside_K, sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener
-from twin_core.calibrate.restricted import ExpectedNoise, no_longer
-from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.starting import balance_start, table_levels
-from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.effects.base import Effect
@@ -29,15 +24,11 @@ from twin_core.network.model import Network, build_network
 from twin_core.network.screened import screened
 from twin_core.network.spec import TwinSpec
 from twin_core.side_by_side import both
-from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
 STEP_ERROR_SHARE = 0.1
 """Time steps are halved until halving changes no reading by more than this share of the noise."""
-
-NO_COVARIANCE = "no uncertainty of the parameters is stated; forecasts carry only that of state and misfit"
-NO_UNCERTAINTY = "the uncertainty of the parameters could not be computed"
 
 STEP_ERROR_FLOOR_K = 1e-3
 """No step is halved for less: no sensor resolves it."""
@@ -314,162 +305,3 @@ def _step_error(problem: Problem, finer: Problem) -> float:
         change = np.abs(read[0] - read[1])[:, problem.network.sensor_node]
         worst = max(worst, float((change / np.maximum(problem.noise_K, STEP_ERROR_FLOOR_K / STEP_ERROR_SHARE)).max()))
     return worst
-
-
-def to_model(
-    calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
-) -> CalibratedModel:
-    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told.
-
-    Where it states one, its misfit is that which the fit was made from, else what the fit has left of it.
-    """
-    problem = calibration.problem
-    network, spec = calibration.network, calibration.network.spec
-    free, failures = None, list[str]()
-    left = [no_longer(model, problem.span_s) for model in calibration.whitener.models]
-    misfit = [(float(model.sigma_ou), float(model.length_s)) for model in left]
-    if uncertain:
-        told = attempted(partial(_uncertainty, calibration), NO_UNCERTAINTY, failures)
-        if told is not None:
-            free, noise = told
-            misfit = [own.misfit or (0.0, length_s) for own, (_, length_s) in zip(noise, misfit, strict=True)]
-    values = network.parameters.as_dict()
-    return CalibratedModel(
-        spec,
-        tuple(_carrying(effect.at_parameters(values), network.parameters.free_names, free) for effect in effects),
-        values,
-        np.zeros((0, 0)) if free is None else free,
-        () if free is None else network.parameters.free_names,
-        {s: float(n) for s, n in zip(spec.sensors, problem.noise_K, strict=True)},
-        {s: std_K for s, (std_K, _) in zip(spec.sensors, misfit, strict=True)},
-        {s: length_s for s, (_, length_s) in zip(spec.sensors, misfit, strict=True)},
-        calibration.max_step_s,
-        dict(network.layout.table_knots),
-        _summary(calibration, effects, free, [*notices, *failures]),
-    )
-
-
-def _uncertainty(calibration: Calibration) -> tuple[FloatArray, list[ExpectedNoise]]:
-    """Return the covariance of the free parameters and the noise it comes from; ArithmeticError where it is not finite."""
-    fit = calibration.problem, calibration.optimum, calibration.whitener
-    noise = noise_of_fit(*fit)
-    free = trajectory_covariance(*fit, noise)[: calibration.problem.n_free, : calibration.problem.n_free]
-    if not np.isfinite(free).all():
-        raise ArithmeticError("it is not finite")
-    return free, noise
-
-
-def stated_guesses(network: Network) -> dict[str, float]:
-    """Return name -> value of the free parameters that the specification guesses, of a network at its starting values."""
-    declared = build_network(network.spec, table_knots=network.layout.table_knots).parameters.parameters
-    told = [p.name for p in declared if not (p.guessed or p.frozen) and p.prior_std is not None]
-    values = network.parameters.as_dict()
-    return {name: values[name] for name in told}
-
-
-def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray | None) -> Effect:
-    """Return an effect with the covariance of its own parameters, where there is one."""
-    if covariance is None:
-        return effect
-    own = [free_names.index(p.name) for p in effect.parameters()]
-    return effect.learned(covariance[np.ix_(own, own)])
-
-
-def _summary(
-    calibration: Calibration, effects: Sequence[Effect], covariance: FloatArray | None, notices: Sequence[str]
-) -> Json:
-    """Return the plain figures of a fit for people and JSON."""
-    problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
-    by_name: dict[str, float] = {}
-    told: dict[str, bool] = {}
-    if covariance is not None:
-        slopes = network.parameters.slopes(network.parameters.free)
-        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        for name in (f"{e.label}.{q.name}" for e in effects for q in e.parameter_specs() if q.open_ended):
-            position = network.parameters.free_names.index(name)
-            if is_open_ended(problem, optimum, position):
-                stds[position] = network.parameters.prior_std[position]
-        by_name = dict(zip(network.parameters.free_names, (stds * slopes).tolist(), strict=True))
-        told = identified(network.parameters, stds)
-    fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
-    fit = with_met(network.spec, fit)
-    first, last = problem.segments[0].record, problem.segments[-1].record
-    heard = [n for s in problem.segments for n in s.record.notices]
-    heard += orbit_notices(network.spec, [s.record for s in problem.segments])
-    return {
-        "train": {
-            "start": first.present(first.time_s[0]),
-            "stop": last.present(last.time_s[-1]),
-            "samples": int(sum(s.valid.any(axis=1).sum() for s in problem.segments)),
-            "segments": len(problem.segments),
-        },
-        "status": optimum.status,
-        "advice": ADVICE[optimum.status],
-        "iterations": optimum.iterations,
-        **fit,
-        "residual_whiteness": residual_whiteness(calibration.residuals),
-        "criteria": acceptance(network.spec, fit["per_sensor"]),
-        "parameters": [
-            {
-                "name": p.name,
-                "unit": p.unit,
-                "mean": p.value,
-                "std": by_name.get(p.name),
-                "identified": told.get(p.name),
-                "held": p.frozen,
-            }
-            for p in network.parameters.parameters
-            if p.tied_to is None  # what is tied is told by what it is tied to
-        ],
-        "words": [
-            *unseen_nodes(network.spec, [e.where["nodes"] for e in effects if "nodes" in e.where]),
-            *resting_channels(network.spec, [s.record for s in problem.segments]),
-            *([NO_COVARIANCE] if covariance is None else _words(calibration, covariance)),
-        ],
-        "correlations": [] if covariance is None else strong_correlations(network.parameters, covariance),
-        "notices": list(dict.fromkeys([*notices, *heard])),
-    }
-
-
-def _words(calibration: Calibration, covariance: FloatArray) -> list[str]:
-    """Return what the data cannot see, in words; nothing where the arithmetic fails."""
-    guesses = stated_guesses(calibration.problem.network)
-    return attempted(lambda: words(calibration.network.parameters, covariance, guesses), "words", []) or []
-
-
-def acceptance(spec: TwinSpec, per_sensor: Json) -> Json:
-    """Return the correlation acceptance: worst errors over the sensors, the limits of all, and whether each meets its own.
-
-    Parameters
-    ----------
-    spec
-        Declares the criteria.
-    per_sensor
-        ``bias_K``, ``std_K`` and ``q99_abs_K`` of each sensor.
-
-    Returns
-    -------
-    dict
-        Worst ``bias_K``, ``std_K`` and ``q99_abs_K``; ``limit_…`` of each; ``met`` by all sensors; and under ``per_sensor``
-        the limits of each and whether it has ``met`` them.
-    """
-    rows = {}
-    for sensor, row in per_sensor.items():
-        limits = spec.criteria.of(sensor)
-        rows[sensor] = {
-            **{f"limit_{name}": limit for name, limit in limits.items()},
-            "met": all(abs(row[name]) <= limit for name, limit in limits.items()),
-        }
-    names = ("bias_K", "std_K", "q99_abs_K")
-    return {
-        **{name: max((abs(row[name]) for row in per_sensor.values()), default=0.0) for name in names},
-        **{f"limit_{name}": getattr(spec.criteria, name) for name in names},
-        "met": all(row["met"] for row in rows.values()),
-        "per_sensor": rows,
-    }
-
-
-def with_met(spec: TwinSpec, scores: Json) -> Json:
-    """Return the scores of a fit or a prediction with whether each sensor has ``met`` its criteria."""
-    rows = acceptance(spec, scores["per_sensor"])["per_sensor"]
-    return {**scores, "per_sensor": {s: {**row, "met": rows[s]["met"]} for s, row in scores["per_sensor"].items()}}

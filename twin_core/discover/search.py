@@ -129,7 +129,8 @@ def search(
 
 def _converge(state: Search) -> None:
     """Take the fit of the model so far to its end, for it is what anything else is weighed against."""
-    state.trial = state.attempt(partial(converged, state.trial), "the model so far") or state.trial
+    what = "a closer fit of " + ("what was found" if state.findings else "the declared model")
+    state.trial = state.attempt(partial(converged, state.trial), what) or state.trial
 
 
 def _places(state: Search) -> set[Place]:
@@ -144,8 +145,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     missing = state.attempt(partial(gain_of_undeclared_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
-    state.attempt(state.trial.log_evidence, "the evidence of the model so far")  # every fork would find it anew
-    what = "effects without a name" if fallback else f"effect {len(state.findings) + 1}"
+    state.attempt(state.trial.log_evidence, "the evidence of the model before effects are added")  # every fork would find it anew
+    what = "effects without a name" if fallback else f"candidates for effect {len(state.findings) + 1}"
     widened = not state.findings or state.trial.unexplained() > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)

@@ -8,10 +8,12 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.criteria import acceptance, with_met
 from twin_core.calibrate.identifiability import strong_correlations
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import Calibration, acceptance, stated_guesses, with_met
+from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import residual_whiteness, score
+from twin_core.calibrate.summary import stated_guesses
 from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.discover.trial import mean_excess
 from twin_core.effects.base import Effect

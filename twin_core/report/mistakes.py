@@ -4,7 +4,7 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.containment import NO_DEADLINE
-from twin_core.calibrate.second_order import stated_guesses
+from twin_core.calibrate.summary import stated_guesses
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.discover.judge import Search
 

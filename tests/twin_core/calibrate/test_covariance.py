@@ -12,7 +12,8 @@ from twin_core.calibrate.covariance import gls_covariance, trajectory_covariance
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.residual_noise import fit_whitener, sensor_jacobians
 from twin_core.calibrate.restricted import ExpectedNoise
-from twin_core.calibrate.second_order import Calibration, fit_trajectories, prepare, to_model
+from twin_core.calibrate.second_order import Calibration, fit_trajectories, prepare
+from twin_core.calibrate.summary import to_model
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec

@@ -22,7 +22,7 @@ from twin_core.calibrate.neural_ode import (
     unembed,
 )
 from twin_core.calibrate.problem import Problem, build_problem
-from twin_core.calibrate.second_order import to_model
+from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.windows import balance_of
 from twin_core.errors import ModelError
 from twin_core.forecast import forecast

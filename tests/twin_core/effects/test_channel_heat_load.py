@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.discover.screen import survey_of
 from twin_core.discover.shortlist import refined
 from twin_core.discover.trial import Trial, try_effects

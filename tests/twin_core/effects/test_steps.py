@@ -18,7 +18,8 @@ from tests.helpers import (
     survey_of,
 )
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.effects import REGISTRY, Effect, Survey, effect_from_json, effect_to_json
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.forecast import forecast

@@ -9,8 +9,10 @@ import pytest
 from tests.analytic import laplacian, linear_states
 from tests.helpers import central_difference, record_of
 from twin_core.calibrate import calibrate
+from twin_core.calibrate.criteria import acceptance
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import acceptance, fit_network, to_model
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.effects import REGISTRY
 from twin_core.errors import ModelError
 from twin_core.network.model import Network, build_network

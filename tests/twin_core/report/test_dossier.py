@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from twin_core.calibrate.second_order import fit_trajectories, to_model
+from twin_core.calibrate.second_order import fit_trajectories
 from twin_core.calibrate.statistics import spread_of
+from twin_core.calibrate.summary import to_model
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
 from twin_core.errors import TelemetryError
 from twin_core.holdout import Prediction
