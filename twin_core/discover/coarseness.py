@@ -1,5 +1,7 @@
 """Coarseness: what a lumped network may leave of any record, and how much more than that a name must explain."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from twin_core.calibrate.containment import attempted
@@ -28,8 +30,12 @@ def least_explained(beside: float, left: float, n_readings: int, *, is_named: bo
     return policy.DOMINANCE * (min(coarseness, policy.MOST_COARSENESS) if is_named else coarseness)
 
 
-def times_asked(simple: Trial, rich: Trial, asked: float, shown: tuple[Trial, Trial] | None = None) -> float:
+def times_asked(
+    simple: Trial, rich: Trial, asked: float, shown: Callable[[], tuple[Trial, Trial] | None] = lambda: None
+) -> float:
     """Return how many times as much as is asked of them effects explain; names that foretell have less to explain.
+
+    Only where it would be too little is asked what they foretell, so that values above one do not rank them.
 
     Coarseness is explained where it was seen; what is really there is foretold. Names that leave less of the variance of the
     error on what they were not fitted to than coarseness could, half of it for a dominance of two, have so much less to
@@ -43,13 +49,13 @@ def times_asked(simple: Trial, rich: Trial, asked: float, shown: tuple[Trial, Tr
     asked
         Variance that they must explain, in units of the sensors' noise.
     shown
-        Trials without any finding and with these names alone; None where what they foretell does not count, as that of a heat
+        Returns the trials without any finding and with these names alone, where what they foretell counts: not that of a heat
         without a name.
     """
     amount = explained(simple, rich)
-    told = attempted(lambda: validate(*shown).foresight, "what names foretell", []) if shown is not None else None
-    if told is not None:
-        asked *= min(1.0, policy.DOMINANCE * told**2)
+    if amount < asked and (alone := shown()) is not None:
+        told = attempted(lambda: validate(*alone).foresight, "what names foretell", [])
+        asked *= 1.0 if told is None else min(1.0, policy.DOMINANCE * told**2)
     return amount / asked if asked > 0.0 else np.inf
 
 
@@ -58,5 +64,5 @@ def stands(simple: Trial, rich: Trial) -> bool:
     left, n_readings = mean_excess(rich), rich.n_samples
     if left <= by_chance(n_readings):
         return True
-    shown = None if simple.effects else (simple, rich)
-    return times_asked(simple, rich, least_explained(rich.unexplained(), left, n_readings), shown) >= 1.0
+    asked = least_explained(rich.unexplained(), left, n_readings)
+    return times_asked(simple, rich, asked, lambda: None if simple.effects else (simple, rich)) >= 1.0

@@ -54,7 +54,7 @@ def withdraw(state: Search, needed: float) -> None:
             asked[places] = least_explained(state.trial.unexplained(), left, n_readings, is_named=places in named)
         without = _without_each(state, asked)
         told = {
-            places: times_asked(kept[0], state.trial, asked[places], _alone(state, places) if places in named else None)
+            places: times_asked(kept[0], state.trial, asked[places], partial(_alone, state, places, named))
             for places, kept in without.items()
             if kept
         }
@@ -74,8 +74,12 @@ def withdraw(state: Search, needed: float) -> None:
             _examine_again(state, rest, needed)
 
 
-def _alone(state: Search, places: frozenset[object]) -> tuple[Trial, Trial] | None:
-    """Return the trials without any finding and with the effects at places alone; None where these cannot be computed."""
+def _alone(
+    state: Search, places: frozenset[object], named: Collection[frozenset[object]]
+) -> tuple[Trial, Trial] | None:
+    """Return the trials without any finding and with those of names at places alone; None where that cannot be computed."""
+    if places not in named:
+        return None
     others = frozenset(effect.place for finding in state.findings for effect in finding.effects) - places
     if not others:
         return state.base, state.trial

@@ -220,7 +220,7 @@ def test_what_cannot_be_computed_is_not_foretold(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(coarseness, "validate", fails)
     simple, rich = stub(left=9.0), stub(load("n0"), left=3.0)
-    assert coarseness.times_asked(simple, rich, 4.0, shown=(simple, rich)) == 1.5
+    assert coarseness.times_asked(simple, rich, 12.0, shown=lambda: (simple, rich)) == 0.5
 
 
 SCORE = score_needed(NEEDED)
