@@ -145,9 +145,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     missing = state.attempt(partial(gain_of_undeclared_heat, state.trial.fit), "how much heat is missing")
     if missing is not None and missing <= needed:
         return False
-    state.attempt(
-        state.trial.log_evidence, "the evidence of the model before effects are added"
-    )  # every fork would find it anew
+    state.attempt(state.trial.log_evidence, "the evidence for the model before")  # every fork would find it anew
     what = "effects without a name" if fallback else f"candidates for effect {len(state.findings) + 1}"
     widened = not state.findings or state.trial.unexplained() > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()

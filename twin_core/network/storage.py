@@ -77,14 +77,15 @@ def to_temperatures_K(
     u grows with T, so there is one, or the limit beyond which it lies: Newton's method from ``near_K``, within a bracket that
     is halved where the capacity bends too sharply for it, for the points that are not found yet.
     """
+    if not network.capacities:
+        return enthalpy_K
     found_K = np.clip(enthalpy_K, *limit_K)
     for node in {term.node for term in network.capacities}:
         terms = [(term, values[network.term_index(term)]) for term in network.capacities if term.node == node]
         near = np.clip(near_K[..., node], *limit_K).ravel()
         own = float(values[network.capacity_index[node]])
-        found_K[..., node] = _inverted(terms, own, enthalpy_K[..., node].ravel(), near, limit_K).reshape(
-            near_K.shape[:-1]
-        )
+        temperature_K = _inverted(terms, own, enthalpy_K[..., node].ravel(), near, limit_K)
+        found_K[..., node] = temperature_K.reshape(found_K.shape[:-1])
     return found_K
 
 

@@ -17,10 +17,11 @@ from tests.helpers import (
     survey_of,
 )
 from twin_core.effects import REGISTRY, Effect
-from twin_core.network import storage
+from twin_core.effects.capacity_temperature import LinearCapacity
 from twin_core.network.model import Network, build_network
 from twin_core.network.spec_io import load_spec
-from twin_core.network.storage import Storage, store, to_enthalpy_K, to_temperatures_K
+from twin_core.network.storage import store, to_enthalpy_K, to_temperatures_K
+from twin_core.network.terms import Capacity
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import rollout
 
@@ -135,18 +136,30 @@ def test_a_temperature_is_found_as_well_as_rounding_allows_and_no_better(monkeyp
     values = network.parameters.values
     temperature = np.linspace(293.0, 400.0, 301)[:, None]
     enthalpy = to_enthalpy_K(network, values, temperature)
-    n_looks = 0
+    n_looks, evaluate = 0, LinearCapacity.evaluate
 
-    def counted(*arguments: Any) -> Storage:
+    def counted(*arguments: Any) -> Capacity:
         nonlocal n_looks
         n_looks += 1
-        return store(*arguments)
+        return evaluate(*arguments)
 
-    monkeypatch.setattr(storage, "store", counted)
+    monkeypatch.setattr(LinearCapacity, "evaluate", counted)
     found = to_temperatures_K(network, values, enthalpy, np.full_like(temperature, 294.0), (0.5, 5e3))
+    assert 2 < n_looks < 40
     slopes = store(network, values, temperature).slope
     assert (np.abs(found - temperature) < 1e-11 + 1e-12 * slopes).all()
-    assert n_looks < 40
+
+
+def test_only_where_a_capacity_changes_is_a_temperature_looked_for() -> None:
+    spec = load_spec(conductive_spec(3, [(0, 1), (1, 2)]))
+    changing = REGISTRY["capacity_temperature"]({"node": "n1"}, {"kappa_per_K": 0.02}, {"T_ref_K": 295.0})
+    network, plain = build_network(spec, [changing]), build_network(spec)
+    temperature = np.random.default_rng(4).uniform(280.0, 310.0, (5, 2, 3))
+    enthalpy = to_enthalpy_K(network, network.parameters.values, temperature)
+    assert np.array_equal(enthalpy[..., ::2], temperature[..., ::2]) and (enthalpy[..., 1] != temperature[..., 1]).all()
+    found = to_temperatures_K(network, network.parameters.values, enthalpy, temperature + 3.0, (0.5, 5e3))
+    np.testing.assert_allclose(found, temperature, atol=1e-9)
+    assert to_temperatures_K(plain, plain.parameters.values, enthalpy, temperature, (0.5, 5e3)) is enthalpy
 
 
 def test_beyond_a_limit_the_limit_is_returned() -> None:
