@@ -8,15 +8,16 @@ itself hardly tells from the best one.
 from collections.abc import Collection
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
 from twin_core.calibrate.second_order import Calibration
-from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.evidence import weigh
+from twin_core.discover.form import acts_at
 from twin_core.discover.judge import Finding, Judged, Search, once_each
-from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened
+from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, each_start, refined, screened
 from twin_core.discover.trial import (
     Trial,
     about_trajectory,
@@ -29,8 +30,12 @@ from twin_core.discover.trial import (
 )
 from twin_core.effects.base import Effect, Place
 
-N_COMPARED = 8
-"""Other names, no less simple, that are fitted at most from either start, the best ones by linear screening first."""
+N_COMPARED = 32
+"""Other names, no less simple, that are fitted at most, the best ones by linear screening first: parameters make up for another
+law, or for a neighbouring place, by so much more than linear responses tell that right names came as late as thirtieth."""
+
+N_VARIED = 6
+"""Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
 
 
 def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, needed: float) -> Finding:
@@ -53,43 +58,42 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         return finding
     least = (1.0 - policy.REPEATABLE_SHARE) * explained(simple, state.trial)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
-    starts = [simple.calibration()]
-    bare = state.attempt(
-        partial(_bare, simple, state.trial.calibration()), "the parameters found, without " + own.label
-    )
-    starts += [bare] if bare is not None else []
-
-    about = [about_trajectory(start.problem, start.optimum) for start in starts]
-    fits = [(simple.fit, starts[0]), *zip(about, starts, strict=True)]
-
-    def in_place(effect: Effect) -> str:
-        return f"{effect.label} instead of {own.label}"
-
-    options = [(start, effect) for fit, start in fits for effect in _near(simple, fit, own, known)]
+    bare = partial(_bare, simple, state.trial.calibration())
+    start = state.attempt(bare, "the parameters found, without " + own.label) or simple.calibration()
+    near = partial(_near, simple, start, state.trial.calibration(), own, known)
+    effects = state.attempt(near, f"names that may explain what {own.label} does") or []
     fitted = state.attempt_each(
         [
-            (partial(_explaining, simple, start, effect, state.trial, least), in_place(effect))
-            for start, effect in options
+            (partial(_explaining, simple, start, effect, state.trial, least), f"{effect.label} instead of {own.label}")
+            for effect in effects
         ]
     )
     best: dict[Place, Trial] = {}
     for trial in sorted((trial for trial in fitted if trial is not None), key=lambda trial: trial.unexplained()):
         best.setdefault(trial.effects[-1].place, trial)
     told = state.attempt_each(
-        [(partial(_supported, state, simple, t, needed), in_place(t.effects[-1])) for t in best.values()]
+        [
+            (partial(_supported, state, simple, t, needed), f"{t.effects[-1].label} instead of {own.label}")
+            for t in best.values()
+        ]
     )
     return Finding(finding.judged, (*finding.alternatives, *once_each([j for j in told if j is not None])))
 
 
-def _near(simple: Trial, about: HeatFit, own: Effect, known: Collection[Place]) -> list[Effect]:
-    """Return the effects that linear screening about a fit hardly tells from one that was found, the best first."""
-    probes = best_of_each_place(
-        screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0].probes, simple.n_samples
-    )
-    gains = {p.effect.place: p.gain for p in probes if len(p.effect.parameter_specs()) <= len(own.parameter_specs())}
-    near = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
-    others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= near]
-    return refined(about, others[:N_COMPARED])
+def _near(simple: Trial, start: Calibration, found: Calibration, own: Effect, known: Collection[Place]) -> list[Effect]:
+    """Return the names that linear screening about the trajectories found puts first, at the simpler model's parameters."""
+    about = about_trajectory(start.problem, start.optimum, found)
+    screening = screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0]
+    most = len(own.parameter_specs())
+    probes = [p for p in screening.probes if p.effect.place not in known and len(p.effect.parameter_specs()) <= most]
+    near = [probe.effect for probe in best_of_each_place(probes, simple.n_samples)[:N_COMPARED]]
+    here = acts_at(simple, (own,))
+    varied = [
+        [p.effect for p in probes if p.effect.place == effect.place][:N_VARIED]
+        for effect in near
+        if acts_at(simple, (effect,)) == here
+    ]
+    return each_start([*refined(about, near), *chain.from_iterable(varied)])
 
 
 def _bare(simple: Trial, found: Calibration) -> Calibration:

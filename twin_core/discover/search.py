@@ -180,7 +180,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     n = len(state.rejected)
     refused = [*by_trajectory.rejected, *by_pairs.rejected[n:], *by_heat.rejected[n:]]
     if not options:
-        state.rejected = refused
+        state.rejected, state.n_named = refused, max(by_heat.n_named, by_trajectory.n_named)
         return False
     state.join(min(options, key=lambda fork: fork.findings[-1].foresight))
     state.rejected = [j for j in refused if j.places != state.findings[-1].judged.places]

@@ -65,9 +65,15 @@ def shortlist(
             if rank < len(ranked) and ranked[rank].gain > needed and len(chosen) < n_wanted:
                 chosen.setdefault(ranked[rank].effect.place, ranked[rank].effect)
     varied = list(chosen)[:N_VARIED]
-    starts = {_start(effect): effect for effect in chosen.values()}
-    for probe in (p for ranked in rankings for p in ranked if p.effect.place in varied):
-        starts.setdefault(_start(probe.effect), probe.effect)
+    others = [probe.effect for ranked in rankings for probe in ranked if probe.effect.place in varied]
+    return each_start([*chosen.values(), *others])
+
+
+def each_start(effects: Sequence[Effect]) -> list[Effect]:
+    """Return effects whose places, numbers of amplitudes or shapes differ, the first of each."""
+    starts: dict[object, Effect] = {}
+    for effect in effects:
+        starts.setdefault(_start(effect), effect)
     return list(starts.values())
 
 
@@ -84,7 +90,7 @@ def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
     n_samples = int(sum(nominal.segment.valid.sum() for nominal in fit.nominals))
     ranked = best_of_each_place(screen(fit, survey, finer).probes, n_samples)
     best = {probe.effect.place: probe.effect for probe in ranked}
-    return list({_start(e): e for e in (best.get(effect.place, effect) for effect in effects)}.values())
+    return each_start([best.get(effect.place, effect) for effect in effects])
 
 
 def schwarz_gain(probe: Probe, n_samples: int) -> float:

@@ -359,19 +359,24 @@ def converged(trial: Trial) -> Trial:
     return replace(trial, effects=effects, fit=fit, near=(trial.calibration().optimum,), simpler=None)
 
 
-def about_trajectory(problem: Problem, optimum: Optimum) -> HeatFit:
-    """Return a problem linearised about its open-loop optimum instead of the measured temperatures."""
+def about_trajectory(problem: Problem, optimum: Optimum, along: Calibration | None = None) -> HeatFit:
+    """Return a problem linearised about its open-loop optimum, or about the trajectories of a richer calibration, ``along``."""
     free = optimum.unknowns[: problem.n_free]
     values = problem.network.parameters.to_values(free)
+    followed, nodes = optimum.fit.trajectories, problem.network.nodes
+    own = list(range(problem.n_nodes))
+    if along is not None:
+        followed = along.optimum.fit.trajectories
+        own = [along.problem.network.nodes.index(node) for node in nodes]
     nominals = tuple(
         linearise(
             problem,
             values,
             segment,
-            np.concatenate([path.start_K[None], path.stages_K[:, 1]]),
+            np.concatenate([path.start_K[None], path.stages_K[:, 1]])[:, own],
             np.zeros((segment.forcing.n_steps, problem.n_nodes)),
         )
-        for segment, path in zip(problem.segments, optimum.fit.trajectories, strict=True)
+        for segment, path in zip(problem.segments, followed, strict=True)
     )
     undeclared = first_size(problem, nominals)
     return HeatFit(problem, free, undeclared, nominals, log_likelihood(problem, undeclared, nominals))
