@@ -11,12 +11,15 @@ from functools import partial
 import numpy as np
 
 from twin_core._typing import FloatArray, Progress, no_progress
-from twin_core.calibrate.approach import approach
+from twin_core.calibrate.approach import CAUTION, approach, misfit_K
 from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Fit, Problem
 from twin_core.calibrate.starting import balance_starts
 from twin_core.errors import NoSolutionError
+from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD
+from twin_core.parameters.transforms import is_logarithmic
+from twin_core.parameters.vector import ParameterSet
 
 MOST_STARTS = 12
 """Starts that are refined at most."""
@@ -29,6 +32,12 @@ EXPLAINED = 1.2
 
 AGREEMENT = 0.01
 """Two starts that end at costs this near to each other, as a share, have found the same optimum."""
+
+N_UNGUIDED = 3
+"""Starts from heat balances alone where every parameter has a guess and the fit from the guesses leaves more than noise."""
+
+UNGUIDED_NATS = 3.0
+"""By so much it must be likelier than the fit from the guesses: positive evidence (Kass and Raftery 1995)."""
 
 SCATTER_LOG_STD = (1.0, 2.0)
 """Further starts: parameters that nobody guessed scattered by factors e and e²."""
@@ -110,7 +119,7 @@ def best_of_starts(
     NoSolutionError
         If every start has failed.
     """
-    guided = not any(p.guessed and not p.frozen for p in problem.network.parameters.parameters)
+    guided = _is_guided(problem)
     failures: list[str] = []
     found: list[tuple[float, Optimum]] = []
     tried, complete = 0, True
@@ -141,7 +150,52 @@ def best_of_starts(
     if not found:
         raise NoSolutionError(no_solution_words(failures))
     best = found[0][1]
+    if guided and not is_late(deadline):
+        best = _unless_likelier_unguided(problem, best, stands_for, deadline)
     return Search(replace(best, iterations=sum(o.iterations for _, o in found)), tried, tuple(failures), complete)
+
+
+def _is_guided(problem: Problem) -> bool:
+    """Return whether every free parameter has a guess."""
+    return not any(p.guessed and not p.frozen for p in problem.network.parameters.parameters)
+
+
+def _unless_likelier_unguided(problem: Problem, guided: Optimum, stands_for: float, deadline: float) -> Optimum:
+    """Return a fit from the guesses, or the best of those from heat balances alone where the guesses were no guesses of this.
+
+    The misfit counts as noise, so that far from the telemetry the priors of wrong guesses hold the search where it began. A fit
+    that nobody guided is followed where the readings, weighed by its misfit, gain more by it than the guesses lose.
+    """
+    if mean_square(problem, guided.fit) < EXPLAINED:
+        return guided
+    unguided = problem.with_network(problem.network.with_parameters(unguessed(problem.network.parameters)))
+    states, best = problem.start()[problem.n_free :], guided
+    for balanced in balance_starts(unguided, always=True)[:N_UNGUIDED]:
+        about = unguided.with_network(problem.network.with_parameters(balanced))
+        start = np.concatenate([balanced.free, states])
+        work = partial(approach, about, start, stands_for=stands_for, deadline=deadline)
+        found = attempted(work, "a start without guesses", [])
+        if found is None or found.status in ("no_solution", "numerical_failure"):
+            continue
+        misfit = misfit_K(problem, found.fit)
+        weighed = replace(problem, noise_K=np.hypot(problem.noise_K, CAUTION * misfit) / np.sqrt(stands_for))
+        gained = weighed.solve(best.unknowns, best.fit).cost - weighed.solve(found.unknowns, found.fit).cost
+        if gained > UNGUIDED_NATS:
+            best = found
+    return best
+
+
+def unguessed(parameters: ParameterSet) -> ParameterSet:
+    """Return parameters as if nobody had guessed the free ones; a stated spread, and bounds, are kept."""
+    return replace(
+        parameters,
+        parameters=tuple(
+            replace(p, guessed=True, prior_std=NO_GUESS_LOG_STD)
+            if not p.frozen and p.prior_std == GUESS_LOG_STD and is_logarithmic(p.transform)
+            else p
+            for p in parameters.parameters
+        ),
+    )
 
 
 def _cost_of(problem: Problem, optimum: Optimum) -> float:

@@ -9,11 +9,14 @@ from benchmarks.starts import attempt
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate import calibrate
+from twin_core.calibrate.multistart import unguessed
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.starting import balance_start, channel_levels, filled_columns
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
+from twin_core.parameters.parameter import NO_GUESS_LOG_STD, positive, real
+from twin_core.parameters.vector import ParameterSet
 from twin_core.telemetry import Record
 from twin_core.telemetry_csv import read_csv
 
@@ -128,6 +131,41 @@ def test_random_networks_are_found_from_any_subset_of_guesses(seed: int) -> None
     """Power over ten decades, 2 to 7 nodes; the truth is integrated by Runge and Kutta's method. All 500: benchmarks.starts."""
     case, outcome = attempt(1000 + seed)
     assert outcome.found, (case.kind, outcome)
+
+
+@pytest.mark.parametrize("off", [1e-3, 30.0, 1e3])
+def test_guesses_that_are_wrong_by_far_do_not_hold_the_fit(off: float) -> None:
+    """Far from the telemetry the misfit counts as noise, so that the priors of wrong guesses held the search where it began."""
+    capacity, conductance = np.array([4.0e3, 2.0e4, 900.0]), [5.0, 0.4]
+    rng = np.random.default_rng(3)
+    time_s = 60.0 * np.arange(600)
+    heat = np.repeat(rng.choice([0.0, 50.0], 60), 10)
+    rates = -laplacian(3, [(0, 1), (1, 2)], conductance) / capacity[:, None]
+    states = linear_states(rates, np.outer(heat, [1.0 / capacity[0], 0.0, 0.0]), np.full(3, 290.0), time_s)
+    readings = {f"T{i}": states[:, i] + rng.normal(0, 0.02, 600) for i in range(3)}
+    truth = {f"C:n{i}": c for i, c in enumerate(capacity)} | {"G:n0|n1": 5.0, "G:n1|n2": 0.4}
+    data = chain_network()
+    for i, row in enumerate([*data["nodes"], *data["conductors"]]):
+        quantity = "capacity_J_per_K" if "id" in row else "conductance_W_per_K"
+        row[quantity] = {"guess": list(truth.values())[i] * off ** (-1.0) ** i}
+    model = calibrate(load_spec(data), [record_of(time_s, Q=heat, **readings)])
+    assert model.summary["rmse_K"] < 1.1 * 0.02
+    for name, value in truth.items():
+        assert abs(np.log(model.values[name] / value)) < 0.1, name
+
+
+def test_a_fit_without_guesses_keeps_what_is_stated_beside_them() -> None:
+    parameters = ParameterSet(
+        (
+            positive("C:free", "J/K", 5.0),
+            positive("C:known", "J/K", 5.0, frozen=True),
+            positive("C:spread", "J/K", 5.0, prior_std=0.1),
+            real("Q", "W", 5.0, prior_std=1.0),
+        )
+    )
+    free, *kept = unguessed(parameters).parameters
+    assert (free.guessed, free.prior_std) == (True, NO_GUESS_LOG_STD)
+    assert tuple(kept) == parameters.parameters[1:]
 
 
 TEMPERATURE_LAB = Path(__file__).resolve().parents[4] / "shared" / "data" / "tclab_notre_dame"
