@@ -71,11 +71,11 @@ def correlate(
 
     A phase at rest counts as much as the longest transient. Exits with 0 whether the criteria are met or not.
     """
-    stop = inf if deadline is None else time.monotonic() + deadline
     from replay.cli.console import notify, print_line, progress_bar, to_json
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import load_records
     from replay.cli.signed import document
+    from twin_core.calibrate.compiled import compile_ahead
     from twin_core.calibrate.phases import Phase
     from twin_core.calibrate.phases import correlate as run
     from twin_core.files import make_folder, write_text
@@ -87,6 +87,9 @@ def correlate(
         raise click.UsageError("give --steady or --transient files")
     if out.exists() and not out.is_dir():
         raise click.UsageError(f"--out {out} is a file; name a folder")
+    if deadline is not None:
+        compile_ahead()
+    stop = inf if deadline is None else time.monotonic() + deadline
     spec = load_spec(spec_file)
     flown = load_records(transient, spec, masking=not no_masking)
     phases = [phase for path in steady for phase in balance_phases(path, spec, flown)]

@@ -48,7 +48,9 @@ class CoreWorkbench:
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
         """Fit the declared network."""
         from twin_core.calibrate import calibrate
+        from twin_core.calibrate.compiled import compile_ahead
 
+        compile_ahead()
         deadline = time.monotonic() + task.deadline_s
 
         siblings = {name: _model_of(document) for name, document in task.siblings.items()}

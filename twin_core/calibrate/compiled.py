@@ -1,0 +1,40 @@
+"""Compilation of what fits need, before any deadline counts; as a command, once after an installation."""
+
+from contextlib import suppress
+from functools import cache
+
+import numpy as np
+
+from twin_core.calibrate.containment import NUMERICAL_FAILURES
+from twin_core.calibrate.second_order import fit_network
+from twin_core.errors import ModelError
+from twin_core.network.spec_io import load_spec
+from twin_core.telemetry import Record
+
+N_SAMPLES = 40
+
+
+@cache
+def compile_ahead() -> None:
+    """Fit a body that cools, once per process: after an installation that compiles the loops of a fit, later it loads them.
+
+    Half a minute of compilation within a search's deadline would leave guesses in the place of a fit.
+    """
+    spec = load_spec(
+        {
+            "twin": "body",
+            "boundaries": {"room": {"value_K": 290.0}},
+            "channels": {"T": {"kind": "temperature", "unit": "K"}},
+            "nodes": [{"id": "body", "sensor": "T", "capacity_J_per_K": {"guess": 100.0}}],
+            "conductors": [{"between": ["body", "room"], "conductance_W_per_K": {"guess": 1.0}}],
+        }
+    )
+    time_s = 10.0 * np.arange(N_SAMPLES)
+    noise_K = 0.1 * np.random.default_rng(0).standard_normal(N_SAMPLES)
+    read_K = np.asarray(290.0 + 20.0 * np.exp(-time_s / 80.0) + noise_K, dtype=np.float64)
+    with suppress(ModelError, *NUMERICAL_FAILURES):  # what fails here fails with its reason where it matters
+        fit_network(spec, [Record(time_s, {"T": read_K})])
+
+
+if __name__ == "__main__":
+    compile_ahead()
