@@ -28,7 +28,14 @@ from twin_core.network.terms import (
     Term,
 )
 from twin_core.network.thermostat import Memory, ThermostatHeat
-from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD, Parameter, positive, real
+from twin_core.parameters.parameter import (
+    GUESS_LOG_STD,
+    NO_GUESS_LOG_STD,
+    Parameter,
+    absolute_temperature,
+    positive,
+    real,
+)
 from twin_core.parameters.vector import ParameterSet
 
 ARITHMETIC_S, ROOM_K = 1e-3, 293.0
@@ -311,7 +318,7 @@ def build_network(
     surroundings = tuple(sorted((b for a in additions for b in a.boundaries), key=lambda term: term.rank))
     parameters: list[Parameter] = [_capacity(spec, node) for node in spec.nodes]
     parameters += [
-        real(f"T:{name}", "K", b.guess_K, prior_std=b.spread or SINK_STD_K)
+        absolute_temperature(f"T:{name}", b.guess_K, prior_std_K=b.spread or SINK_STD_K)
         for name, b in spec.boundaries.items()
         if b.guess_K is not None
     ]

@@ -153,6 +153,24 @@ def test_an_unknown_sink_is_found() -> None:
     assert model.values["T:room"] == pytest.approx(ROOM_K, abs=1.0)
 
 
+def test_no_sink_is_colder_than_absolute_zero() -> None:
+    """The meter of the heat reads 400 W too much, all else is known: the sink that balances it lies 159 K below zero."""
+    data = declared()
+    data["boundaries"]["room"] = {"guess_K": 250.0}
+    for node, name in zip(data["nodes"], ("C:a", "C:b"), strict=True):
+        node["capacity_J_per_K"] = {"value": float(TRUTH[name])}
+    for conductor, name in zip(data["conductors"], ("G:a|b", "G:b|room"), strict=True):
+        conductor["conductance_W_per_K"] = {"value": TRUTH[name]}
+    data["loads"][0]["node"] = "b"
+    time_s = STEP_S * np.arange(300)
+    wrong = ROOM_K - 400.0 / WALL_W_PER_K
+    assert wrong < -100.0
+    read = exact_K(np.zeros(300), time_s) + np.random.default_rng(3).normal(0.0, NOISE_K, (300, 2))
+    model = calibrate(load_spec(data), [record_of(time_s, Q=np.full(300, 400.0), T_a=read[:, 0], T_b=read[:, 1])])
+    assert model.values["T:room"] == 0.0
+    assert "T:room ends at its bound of 0 K; the data pull below it" in model.summary["words"]
+
+
 def test_guesses_that_nobody_made_are_found_from_the_data() -> None:
     data = declared()
     for node in data["nodes"]:

@@ -1,6 +1,7 @@
 """What the data cannot see, in words."""
 
 import numpy as np
+import pytest
 
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.identifiability import (
@@ -13,7 +14,7 @@ from twin_core.calibrate.identifiability import (
     words,
 )
 from twin_core.network.spec_io import load_spec
-from twin_core.parameters.parameter import positive, real
+from twin_core.parameters.parameter import absolute_temperature, positive, real
 from twin_core.parameters.vector import ParameterSet
 
 SET = ParameterSet(
@@ -98,3 +99,38 @@ def test_channels_at_rest_are_said() -> None:
     (said,) = resting_channels(spec, [record])
     assert said.startswith("channel 'T0' never changes") and "stuck" in said
     assert resting_channels(spec, [record, record_of(time_s, T0=291.0, T1=290.0)]) == []
+
+
+BOUNDED = positive("C:b", "J/K", 100.0, bounds=(50.0, 200.0))
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [
+        (199.9, 0.1, ["C:b ends at its bound of 200 J/K; the data pull above it: widen it if it is not known"]),
+        (50.1, 5.0, ["C:b ends at its bound of 50 J/K; the data pull below it: widen it if it is not known"]),
+        (150.0, 0.1, []),
+        (100.0, 5.0, ["the data do not determine C:b; it stays near its guess"]),
+    ],
+)
+def test_a_bound_that_the_data_pull_beyond_is_told(value: float, std: float, said: list[str]) -> None:
+    """The guess is the middle of the interval in ln: 1 % from an end is 6 standard deviations of its prior away, two thirds 1."""
+    assert words(ParameterSet((BOUNDED.at(value),)), np.array([[std**2]]), {"C:b": 100.0}) == said
+
+
+def test_bounds_that_leave_no_room_hold_what_the_data_do_not_tell() -> None:
+    tight = positive("C:b", "J/K", 100.0, bounds=(90.0, 110.0))
+    said = words(ParameterSet((tight,)), np.array([[25.0]]), {"C:b": 100.0})
+    assert said == [
+        "the data do not determine C:b; its bounds of 90 to 110 J/K hold it: widen them if they are not known"
+    ]
+
+
+def test_a_guess_near_its_bound_is_not_pulled_there() -> None:
+    near = positive("C:b", "J/K", 198.0, bounds=(50.0, 200.0))
+    assert words(ParameterSet((near,)), np.array([[0.01]]), {"C:b": 198.0}) == []
+
+
+def test_a_sink_is_told_by_its_own_size() -> None:
+    sink = ParameterSet((absolute_temperature("T:sink", 250.0, prior_std_K=50.0),))
+    assert unseen_parameters(sink, np.array([40.0])) == [] and unseen_parameters(sink, np.array([300.0])) == ["T:sink"]
