@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 _FOLDER = Path(__file__).parent / "templates"
+_TITLE = "thermal model correlation"
 _BINS = 40
 _MOST_FLOWS = 60
 
@@ -44,6 +45,7 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         report=report,
         plots=plots,
         version=__version__,
+        title=_TITLE,
         headline=phrasing.headline(report),
         gain=phrasing.gain(_rmse(report, "before"), _rmse(report, "after")),
         fell=_fell(report),
@@ -64,6 +66,11 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         data=_for_script(_chart_data(plots)),
         **{name: _asset(name) for name in ("style", "script", "uplot_style", "uplot_script")},
     )
+
+
+def is_report(page: str) -> bool:
+    """Return whether a text is a page that :func:`render` wrote."""
+    return page.lstrip().startswith("<!doctype html>") and f" – {_TITLE}</title>" in page
 
 
 @cache
