@@ -85,6 +85,7 @@ def _template() -> "Template":
         keep_trailing_newline=True,
     )
     for function in (
+        phrasing.ambiguities,
         phrasing.in_words,
         phrasing.instant,
         phrasing.kelvin,
