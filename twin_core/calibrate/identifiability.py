@@ -1,12 +1,13 @@
 """Which parameters the data can see, in numbers and in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.parameters.parameter import Parameter
 from twin_core.parameters.transforms import FROM_ZERO, Identity, LogInterval, is_logarithmic
@@ -224,6 +225,24 @@ def unseen_nodes(spec: TwinSpec, joined: Sequence[Sequence[str]] = ()) -> list[s
     for _ in nodes:
         seen |= {end for pair in pairs if pair <= nodes and pair & seen for end in pair}
     return [f"no sensor sees node '{n.id}': all that is said of it is a guess" for n in spec.nodes if n.id not in seen]
+
+
+def untold_words(network: Network, records: Sequence[Record], positions: Iterable[int]) -> list[str]:
+    """Return a statement for every free parameter, by its position among them, to which no reading and no prior answers.
+
+    Most are knots of a table that its channel never comes near.
+    """
+    said = []
+    for position in positions:
+        name = network.parameters.free_names[position]
+        channel = name.removeprefix("table:").partition("|")[0]
+        seen = [r.values[channel] for r in records if name.startswith("table:") and channel in r.values]
+        samples = np.concatenate([x[np.isfinite(x)] for x in seen] or [np.zeros(0)])
+        why = "no reading answers to it"
+        if samples.size:
+            why = f"channel '{channel}' stays between {samples.min():.4g} and {samples.max():.4g} and never comes near that knot"
+        said.append(f"the data do not determine {name}: {why}; leave it out, or calibrate on telemetry that gets there")
+    return said
 
 
 def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
