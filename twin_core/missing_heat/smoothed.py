@@ -164,8 +164,8 @@ class MissingHeat:
         return [heat.row() for heat in self.heats]
 
     def words(self) -> list[str]:
-        """Return one sentence per node."""
-        return [heat.words() for heat in self.heats]
+        """Return one sentence per node; none of a node at which no heat at all is missing, as where nothing reaches it."""
+        return [heat.words() for heat in self.heats if heat.mean_W.any()]
 
 
 def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> MissingHeat:

@@ -125,6 +125,11 @@ def test_what_a_heat_follows_is_told_as_far_as_it_was_looked_for(share, words):
     assert replace(_heat(None, 4.0), follows={"channel Q": share}).words().endswith(words)
 
 
+def test_nothing_is_said_of_a_node_that_lacks_nothing():
+    told = module.MissingHeat((_heat(None, 0.0), _heat(None, 4.0)))
+    assert len(told.words()) == 1 and "lacks 4 W" in told.words()[0] and len(told.rows()) == 2
+
+
 WAVE = np.sin(np.arange(50.0) / 5.0)
 
 
