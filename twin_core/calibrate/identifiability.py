@@ -33,6 +33,9 @@ AT_BOUND, PULLED = 0.05, 2.0
 """Share of an interval (in ln) next to a bound that counts as the bound, and standard deviations of its prior by which the data
 must have moved a parameter towards it: the prior pulls back as hard as the data pull beyond."""
 
+OFF_LEVEL, MOST_OFF = 0.02, 0.1
+"""Share of its range by which a sample lies off a level, and share of samples that may: slews are quick."""
+
 TOGETHER = 0.5
 """Parameters of a weak direction are told together where their estimates are correlated by more than this."""
 
@@ -242,6 +245,23 @@ def untold_words(network: Network, records: Sequence[Record], positions: Iterabl
         if samples.size:
             why = f"channel '{channel}' stays between {samples.min():.4g} and {samples.max():.4g} and never comes near that knot"
         said.append(f"the data do not determine {name}: {why}; leave it out, or calibrate on telemetry that gets there")
+    return said
+
+
+def blurred_levels(network: Network, records: Sequence[Record]) -> list[str]:
+    """Return a statement for every channel that is declared with levels but mostly rests at none that was found."""
+    said = []
+    for channel, levels in {channel: knots for (channel, _), knots in network.layout.table_knots.items()}.items():
+        samples = np.concatenate([r.values[channel] for r in records if channel in r.values] or [np.zeros(0)])
+        samples = samples[np.isfinite(samples)]
+        if samples.size == 0 or not levels:
+            continue
+        off = np.abs(samples[:, None] - np.array(levels)).min(axis=1) > OFF_LEVEL * np.ptp(samples)
+        if off.mean() > MOST_OFF:
+            said.append(
+                f"channel '{channel}' is declared with levels, but {off.mean():.0%} of its samples lie at none of the "
+                f"{len(levels)} that were found: if it changes continuously, declare knots instead"
+            )
     return said
 
 

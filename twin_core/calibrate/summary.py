@@ -10,6 +10,7 @@ from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.covariance import is_open_ended, noise_of_fit, trajectory_covariance
 from twin_core.calibrate.criteria import acceptance, with_met
 from twin_core.calibrate.identifiability import (
+    blurred_levels,
     identified,
     resting_channels,
     strong_correlations,
@@ -23,7 +24,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.effects.base import Effect
-from twin_core.network.model import Network, build_network
+from twin_core.network.model import Network, build_network, told_values
 from twin_core.simulate.orbit_inputs import orbit_notices
 
 NO_COVARIANCE = "no uncertainty of the parameters is stated; forecasts carry only that of state and misfit"
@@ -96,6 +97,7 @@ def _summary(
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
     untold = np.flatnonzero(np.diag(optimum.hessian)[: problem.n_free] <= 0.0)
     by_name: dict[str, float | None] = {}
+    values = told_values(network)
     told: dict[str, bool] = {}
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
@@ -112,6 +114,7 @@ def _summary(
     fit = with_met(network.spec, fit)
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
+    heard += blurred_levels(network, [s.record for s in problem.segments])
     heard += orbit_notices(network.spec, [s.record for s in problem.segments])
     return {
         "train": {
@@ -130,7 +133,7 @@ def _summary(
             {
                 "name": p.name,
                 "unit": p.unit,
-                "mean": p.value,
+                "mean": values[p.name],
                 "std": by_name.get(p.name),
                 "identified": told.get(p.name),
                 "held": p.frozen,

@@ -361,6 +361,12 @@ def _capacity(spec: TwinSpec, node: Node) -> Parameter:
     return positive(f"C:{node.id}", "J/K", ARITHMETIC_S * (sum(joined) or 1.0), frozen=True)
 
 
+def told_values(network: Network) -> dict[str, float]:
+    """Return name -> value of every parameter as it is told: 0 for a capacity declared as nothing, whatever stands for it."""
+    nothing = {f"C:{n.id}": 0.0 for n in network.spec.nodes if n.capacity_J_per_K and n.capacity_J_per_K.value == 0.0}
+    return network.parameters.as_dict() | nothing
+
+
 def declared_terms(layout: Layout) -> list[Term]:
     """Return the terms of the specification."""
     spec = layout.spec

@@ -146,6 +146,16 @@ def test_levels_of_a_table_are_read_from_the_telemetry() -> None:
     np.testing.assert_allclose(found, [0.0, 30.0, 12.0], atol=1.0)
 
 
+def test_a_node_that_stores_nothing_is_told_as_declared() -> None:
+    """What stands for a capacity of nothing in the arithmetic is told to nobody."""
+    data = declared()
+    data["nodes"].append({"id": "skin", "capacity_J_per_K": {"value": 0.0}})
+    data["conductors"].append({"between": ["a", "skin"], "conductance_W_per_K": {"value": 150.0}})
+    model = calibrate(load_spec(data), [telemetry()])
+    (row,) = [row for row in model.summary["parameters"] if row["name"] == "C:skin"]
+    assert row["mean"] == 0.0 and row["held"] and model.values["C:skin"] > 0.0
+
+
 def test_knots_that_the_channel_never_reaches_are_told() -> None:
     """Half of the knots lie where the channel goes: what it does not visit has no uncertainty, and disturbs no other."""
     data = declared()

@@ -5,6 +5,7 @@ import pytest
 
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.identifiability import (
+    blurred_levels,
     identified,
     resting_channels,
     strong_correlations,
@@ -13,6 +14,7 @@ from twin_core.calibrate.identifiability import (
     weakest_direction,
     words,
 )
+from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.parameters.parameter import absolute_temperature, positive, real
 from twin_core.parameters.vector import ParameterSet
@@ -134,3 +136,21 @@ def test_a_guess_near_its_bound_is_not_pulled_there() -> None:
 def test_a_sink_is_told_by_its_own_size() -> None:
     sink = ParameterSet((absolute_temperature("T:sink", 250.0, prior_std_K=50.0),))
     assert unseen_parameters(sink, np.array([40.0])) == [] and unseen_parameters(sink, np.array([300.0])) == ["T:sink"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        (np.linspace(0.0, 10.0, 101), True),  # continuous: only what lies at an end is at a level
+        (np.repeat([0.0, 10.0], 50), False),
+        (np.concatenate([np.repeat([0.0, 10.0], 50), [2.0, 5.0, 8.0]]), False),  # a slew
+    ],
+)
+def test_a_continuous_channel_has_no_levels(mode: np.ndarray, told: bool) -> None:
+    data = conductive_spec(1, [], channels={"mode": {"kind": "auxiliary", "levels": True}})
+    data["loads"] = [{"channel": "mode", "node": "n0", "table": {}}]
+    network = build_network(load_spec(data), table_knots={("mode", "n0"): (0.0, 10.0)})
+    said = blurred_levels(network, [record_of(np.arange(float(mode.size)), mode=mode)])
+    assert [line.startswith("channel 'mode' is declared with levels, but 94% of its samples") for line in said] == [
+        True
+    ] * told
