@@ -91,7 +91,10 @@ class Record:
     def channel(self, name: str) -> FloatArray:
         """Return one channel, (n_times,); TelemetryError if the record lacks it."""
         if name not in self.values:
-            raise TelemetryError(f"{self.name}: channel '{name}' is missing; the file has {', '.join(self.values)}")
+            raise TelemetryError(
+                f"{self.name}: channel '{name}' is missing, and the specification needs it; add its samples, or take it out "
+                f"of the specification (there are {', '.join(self.values)})"
+            )
         return self.values[name]
 
     def between(self, start_s: float, stop_s: float) -> Self:

@@ -12,7 +12,7 @@ import numpy as np
 import orjson
 from numpy.typing import NDArray
 
-from replay.bridges.errors import BridgeError
+from replay.bridges.errors import BadTimeError, BridgeError
 from replay.bridges.time_scales import Instants, Stated, from_numbers, from_texts
 from replay.recording import Recording, align
 
@@ -71,18 +71,22 @@ def _read_csv(path: Path, wish: Wish) -> Recording:
         head = stream.readline()
         stream.seek(0)
         delimiter = max("\t;,", key=head.count)
-        rows = [row for row in csv.reader(stream, delimiter=delimiter) if any(cell.strip() for cell in row)]
+        reader = csv.reader(stream, delimiter=delimiter)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     if len(rows) < 2:
         raise BridgeError(f"{path}: holds no rows")
-    header, *body = rows
-    for number, row in enumerate(body, start=2):
+    lines, (header, *body) = [line for line, _ in rows[1:]], [row for _, row in rows]
+    for line, row in zip(lines, body, strict=True):
         if len(row) != len(header):
-            raise BridgeError(f"{path}: row {number} has {len(row)} cells, the header {len(header)}")
+            raise BridgeError(f"{path}: row {line} has {len(row)} cells, the header {len(header)}")
     columns = {name.strip(): [row[k].strip() for row in body] for k, name in enumerate(header)}
     if len(columns) != len(header):
         raise BridgeError(f"{path}: two columns have the same name")
     times = columns.pop(_time_name(path, list(columns), wish))
-    instants = _instants(path, times, wish.stated)
+    try:
+        instants = _instants(path, times, wish.stated)
+    except BadTimeError as error:
+        raise error.on_line(lines[error.row]) from error
     numbers, notices = {}, []
     for name, texts in columns.items():
         column, said = _numbers(name, texts)

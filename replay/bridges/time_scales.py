@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
-from replay.bridges.errors import BridgeError
+from replay.bridges.errors import BadTimeError, BridgeError
 
 IntArray = NDArray[np.int64]
 NS = 1_000_000_000
@@ -73,14 +73,12 @@ def from_texts(texts: Sequence[str], stated: Stated, name: str) -> Instants:
     for row, text in enumerate(texts):
         match = _TEXT.fullmatch(text.strip())
         if match is None:
-            raise BridgeError(f"{name}: row {row + 1}: '{text[:40]}' is no time such as 2026-03-01T00:00:00Z")
+            raise BadTimeError(name, row, f"'{text[:40]}' is no time such as 2026-03-01T00:00:00Z")
         zone = match[6]
         if zone is None and stated.scale is None:
-            raise BridgeError(
-                f"{name}: row {row + 1}: '{text}' states no zone; say with --time-scale which scale it is in"
-            )
+            raise BadTimeError(name, row, f"'{text}' states no zone; say with --time-scale which scale it is in")
         if zone is not None and stated.scale not in (None, "utc"):
-            raise BridgeError(f"{name}: row {row + 1}: '{text}' is UTC by its zone, --time-scale says {stated.scale}")
+            raise BadTimeError(name, row, f"'{text}' is UTC by its zone, --time-scale says {stated.scale}")
         readings[row], leap = _reading(match, name, row)
         leaps += leap
     notices = [f"{name}: {leaps} time(s) within a leap second count as the second after it"] if leaps else []
@@ -98,13 +96,13 @@ def _reading(match: re.Match[str], name: str, row: int) -> tuple[int, bool]:
         head = f"{year} {day} {clock}{'59' if is_leap else second}"
         when = datetime.strptime(head, "%Y %j %H:%M:%S" if len(day) == 3 else "%Y %m-%d %H:%M:%S")
     except ValueError as error:
-        raise BridgeError(f"{name}: row {row + 1}: {match[0]} is on no calendar") from error
+        raise BadTimeError(name, row, f"{match[0]} is on no calendar") from error
     if zone is not None and zone[0] in "+-":
         minutes = 60 * int(zone[1:3]) + int(zone[-2:])
         when -= timedelta(minutes=minutes if zone[0] == "+" else -minutes)
     whole = (when - datetime(1970, 1, 1)) // timedelta(seconds=1) + is_leap
     if is_leap and (whole * NS not in STEPS_NS):
-        raise BridgeError(f"{name}: row {row + 1}: there was no leap second at {match[0]}")
+        raise BadTimeError(name, row, f"there was no leap second at {match[0]}")
     return whole * NS + int((fraction or "").ljust(9, "0")), is_leap
 
 
@@ -164,6 +162,6 @@ def _check(readings: IntArray, name: str) -> None:
     if wrong.any():
         row = int(np.argmax(wrong))
         at = np.datetime64(int(readings[row]), "ns").astype("datetime64[s]")
-        raise BridgeError(
-            f"{name}: row {row + 1}: the time is {at}, beyond 1972 to 2199; check --epoch, --time-unit and --time-scale"
+        raise BadTimeError(
+            name, row, f"the time is {at}, beyond 1972 to 2199; check --epoch, --time-unit and --time-scale"
         )

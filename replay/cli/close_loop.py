@@ -1,6 +1,7 @@
 """``twin close-loop``: from telemetry to a verdict, without a service."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -217,14 +218,14 @@ def _print_fleet(reports: dict[str, dict[str, Any]], out: Path, as_json: bool) -
 def print_report(report: dict[str, Any]) -> None:
     """Print the verdict, the findings, the held-out error before and after, and what the data cannot tell."""
     from replay.cli.console import print_line, print_table, short
-    from twin_core.report.phrasing import headline, sentence
+    from twin_core.report.phrasing import ambiguities, headline, sentence
 
     print_line(f"{report['twin']}: {FOUND if report['findings'] else headline(report)}")
     for finding in report["findings"]:
         print_line(f"  {sentence(finding)}")
         print_line(f"  {describe(finding)}; log Bayes factor {short(finding['evidence']['log_bayes_factor'])}")
-        for other in finding["alternatives"]:
-            print_line(f"    cannot be told from {describe(other)}")
+        for told in ambiguities(finding, describe):
+            print_line(f"    {told[:1].lower()}{told[1:]}")
     before, after = report["before"], report["after"]
     rows = [["all sensors", short(before["rmse_K"]), short(after["rmse_K"])]]
     for sensor, scores in before["per_sensor"].items():
@@ -234,7 +235,7 @@ def print_report(report: dict[str, Any]) -> None:
         print_line(words)
 
 
-def describe(finding: dict[str, Any]) -> str:
+def describe(finding: Mapping[str, Any]) -> str:
     """Return an effect, its place and its parameters in one phrase."""
     from replay.cli.console import short
 

@@ -1,8 +1,12 @@
 """``twin print``: a report page as PDF, printed by whatever Chromium or Chrome the machine has."""
 
+import os
 import shutil
+import signal
 import subprocess
 import tempfile
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import click
@@ -29,33 +33,60 @@ def print_page(page: Path, out: Path | None) -> None:
 
 
 def as_pdf(page: Path, out: Path) -> None:
-    """Print a page that stands on this machine into a PDF.
+    """Print a report page that stands on this machine into a PDF.
 
     Raises
     ------
     ReplayError
-        If there is no browser, no page, or the browser wrote nothing.
+        If there is no browser, no report page, or the browser wrote nothing in time.
     """
     from replay.errors import ReplayError
+    from twin_core.report.html import is_report
 
+    try:
+        text = page.read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise ReplayError(f"{page}: cannot be read ({error.strerror or error})") from error
+    if not is_report(text):
+        raise ReplayError(
+            f"{page}: is no report page of this tool; name the report.html that twin close-loop, correlate or demo left"
+        )
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         raise ReplayError(f"{out}: needs Chromium or Chrome; install one, or print {page} from any browser")
-    if not page.is_file():
-        raise ReplayError(f"{page}: cannot be read (no such file)")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        printed = Path(folder) / "page.pdf"
         flags = ["--headless", "--disable-gpu", "--no-sandbox", "--no-first-run", "--disable-background-networking"]
         flags += [f"--user-data-dir={folder}/profile", "--no-pdf-header-footer", "--force-device-scale-factor=2"]
-        flags += ["--virtual-time-budget=4000", f"--print-to-pdf={folder}/page.pdf", page.resolve().as_uri()]
-        try:
-            run = subprocess.run([browser, *flags], capture_output=True, text=True, timeout=PRINT_TIMEOUT_S)
-        except subprocess.TimeoutExpired as error:
-            raise ReplayError(f"{out}: {browser} did not finish within {PRINT_TIMEOUT_S:g} s") from error
-        printed = Path(folder) / "page.pdf"
+        flags += ["--virtual-time-budget=4000", f"--print-to-pdf={printed}", page.resolve().as_uri()]
+        if not _ended([browser, *flags], PRINT_TIMEOUT_S):
+            raise ReplayError(
+                f"{out}: {browser} did not finish within {PRINT_TIMEOUT_S:g} s; print {page} from any browser's menu"
+            )
         if not printed.is_file():
-            said = (run.stderr.strip().splitlines() or ["no message"])[-1]
-            raise ReplayError(f"{out}: {browser} wrote no PDF ({said})")
+            raise ReplayError(f"{out}: {browser} wrote no PDF; print {page} from any browser's menu")
         try:
             shutil.copyfile(printed, out)
         except OSError as error:
             raise ReplayError(f"{out}: cannot be written ({error.strerror or error})") from error
+
+
+def _ended(command: Sequence[str], limit_s: float) -> bool:
+    """Run a command and return whether it ended by itself in time; neither it nor what it started outlives the call.
+
+    A termination of this process interrupts the wait as Ctrl-C does.
+    """
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        process.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        return False
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        signal.signal(signal.SIGTERM, before)
+    return True

@@ -328,6 +328,9 @@ def test_decoded_frames_become_telemetry(tmp_path: Path, spec: str, capsys: pyte
     [
         ("x.csv", b"", "holds no rows"),
         ("x.csv", b"time,a\n2026-03-01T00:00:00Z\n", "row 2 has 1 cells, the header 2"),
+        ("x.csv", b"time,a\n\n2026-03-01T00:00:00Z\n", "row 3 has 1 cells, the header 2"),
+        ("x.csv", b"time,a\n2026-03-01T00:00:00Z,1\n\nyesterday,2\n", "x.csv: row 4: 'yesterday' is no time"),
+        ("x.csv", b"time,a\n1969-01-01T00:00:00Z,1\n", "x.csv: row 2: the time is 1969-01-01"),
         ("x.csv", b"when,a\n2026-03-01T00:00:00Z,1\n", "which column is the time"),
         ("x.csv", b"time,a\n1772323200,1\n", "what they count from"),
         ("x.csv", b"time,a\n2026-03-01T00:00:00Z,ON\n", "no column of numbers"),

@@ -1,6 +1,7 @@
 """Forecasts against closed forms, their plans, and the coverage of their bands on spacecraft that SciPy simulated."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -223,3 +224,12 @@ def test_nine_of_ten_readings_lie_in_the_band() -> None:
         inside.append(((measured >= low) & (measured <= high)).ravel())
     coverage = float(np.concatenate(inside).mean())
     assert 0.85 < coverage < 0.95, coverage
+
+
+def test_a_horizon_of_too_many_steps_is_told_by_its_name() -> None:
+    """With steps of 10 ms, twenty million of them reach 200,000 s."""
+    quick = replace(integrator(), max_step_s=0.01)
+    with pytest.raises(
+        ModelError, match=r"horizon_s: 1e\+06 s are 1e\+08 steps of at most 0.01 s.*ask for 2e\+05 s or less"
+    ):
+        forecast(quick, now(), 1e6, step_s=10.0, state=known_start())

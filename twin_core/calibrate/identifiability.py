@@ -1,15 +1,16 @@
 """Which parameters the data can see, in numbers and in words."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from twin_core._typing import FloatArray
+from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.parameters.parameter import Parameter
-from twin_core.parameters.transforms import Identity, is_logarithmic
+from twin_core.parameters.transforms import FROM_ZERO, Identity, LogInterval, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
 from twin_core.telemetry import Record
 
@@ -28,6 +29,13 @@ NEAR = 1.5
 FAR = 10.0
 """Beyond this factor a guess was no guess of the same thing: a prior of a factor e puts less than 3 % there."""
 
+AT_BOUND, PULLED = 0.05, 2.0
+"""Share of an interval (in ln) next to a bound that counts as the bound, and standard deviations of its prior by which the data
+must have moved a parameter towards it: the prior pulls back as hard as the data pull beyond."""
+
+OFF_LEVEL, MOST_OFF = 0.02, 0.1
+"""Share of its range by which a sample lies off a level, and share of samples that may: slews are quick."""
+
 TOGETHER = 0.5
 """Parameters of a weak direction are told together where their estimates are correlated by more than this."""
 
@@ -45,14 +53,15 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     Returns
     -------
     list of str
-        Positive parameters uncertain by more than a factor e, signed ones by more than their own size, others by one in
-        the solver's coordinate: a whole share, or an onset by as much as lies between two looks for it.
+        Positive parameters uncertain by more than a factor e, signed ones and temperatures by more than their own size, others
+        by one in the solver's coordinate: a whole share, or an onset by as much as lies between two looks for it.
     """
     names = []
     for position, index in enumerate(parameters.free_index):
         parameter = parameters.parameters[index]
         prior = np.inf if parameter.prior_std is None else LITTLE_LEARNED * parameter.prior_std
-        limit = abs(parameter.value) if isinstance(parameter.transform, Identity) else min(UNSEEN_STD, prior)
+        own_size = isinstance(parameter.transform, Identity) or parameter.transform == FROM_ZERO
+        limit = abs(parameter.value) if own_size else min(UNSEEN_STD, prior)
         if not std[position] < max(limit, 1e-12):
             names.append(parameter.name)
     return names
@@ -112,7 +121,14 @@ def words(
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     by_name = {p.name: p for p in parameters.parameters}
     unseen = unseen_parameters(parameters, std)
-    said = [f"the data do not determine {name}; {_whereabouts(by_name[name], guesses.get(name))}" for name in unseen]
+    declared = {name: by_name[name].at(guess) for name, guess in guesses.items() if name in by_name}
+    held = {p.name: told for p in parameters.parameters if (told := _beyond_bound(p, declared.get(p.name)))}
+    said = [
+        f"the data do not determine {name}; {_whereabouts(by_name[name], guesses.get(name))}"
+        for name in unseen
+        if name not in held
+    ]
+    said += held.values()
     direction = weakest_direction(parameters, covariance)
     return said + ([direction] if direction else [])
 
@@ -141,7 +157,34 @@ def how_far(parameter: Parameter, guess: float) -> str:
     return f"{size:.3g}{unit} {way} its guess of {guess:.3g}{unit}"
 
 
+def _beyond_bound(parameter: Parameter, declared: Parameter | None) -> str | None:
+    """Return in words that the data pull a parameter beyond the bound at which it ended; None where they do not."""
+    if parameter.frozen or parameter.tied_to is not None:
+        return None
+    transform, unit = parameter.transform, f" {parameter.unit}".rstrip()
+    if transform == FROM_ZERO:
+        at_zero = parameter.value <= 0.0
+        return f"{parameter.name} ends at its bound of 0{unit}; the data pull below it" if at_zero else None
+    if not isinstance(transform, LogInterval) or declared is None:
+        return None
+    share = np.log(parameter.value / transform.lower) / np.log(transform.upper / transform.lower)
+    pull = (parameter.free - declared.free) / (parameter.prior_std or np.inf)
+    for near, bound, way in (
+        (share < AT_BOUND and pull < -PULLED, transform.lower, "below"),
+        (share > 1.0 - AT_BOUND and pull > PULLED, transform.upper, "above"),
+    ):
+        if near:
+            return f"{parameter.name} ends at its bound of {bound:.3g}{unit}; the data pull {way} it: widen it if it is not known"
+    return None
+
+
 def _whereabouts(parameter: Parameter, guess: float | None) -> str:
+    if (
+        isinstance(parameter.transform, LogInterval)
+        and np.log(parameter.transform.upper / parameter.transform.lower) < UNSEEN_STD
+    ):
+        ends = f"{parameter.transform.lower:.3g} to {parameter.transform.upper:.3g} {parameter.unit}".rstrip()
+        return f"its bounds of {ends} hold it: widen them if they are not known"
     if guess is None:
         return f"nobody guessed it, and {parameter.value:.3g} {parameter.unit}".rstrip() + " is one value of many"
     near = NEAR if is_logarithmic(parameter.transform) else 0.1 * abs(guess)
@@ -185,6 +228,41 @@ def unseen_nodes(spec: TwinSpec, joined: Sequence[Sequence[str]] = ()) -> list[s
     for _ in nodes:
         seen |= {end for pair in pairs if pair <= nodes and pair & seen for end in pair}
     return [f"no sensor sees node '{n.id}': all that is said of it is a guess" for n in spec.nodes if n.id not in seen]
+
+
+def untold_words(network: Network, records: Sequence[Record], positions: Iterable[int]) -> list[str]:
+    """Return a statement for every free parameter, by its position among them, to which no reading and no prior answers.
+
+    Most are knots of a table that its channel never comes near.
+    """
+    said = []
+    for position in positions:
+        name = network.parameters.free_names[position]
+        channel = name.removeprefix("table:").partition("|")[0]
+        seen = [r.values[channel] for r in records if name.startswith("table:") and channel in r.values]
+        samples = np.concatenate([x[np.isfinite(x)] for x in seen] or [np.zeros(0)])
+        why = "no reading answers to it"
+        if samples.size:
+            why = f"channel '{channel}' stays between {samples.min():.4g} and {samples.max():.4g} and never comes near that knot"
+        said.append(f"the data do not determine {name}: {why}; leave it out, or calibrate on telemetry that gets there")
+    return said
+
+
+def blurred_levels(network: Network, records: Sequence[Record]) -> list[str]:
+    """Return a statement for every channel that is declared with levels but mostly rests at none that was found."""
+    said = []
+    for channel, levels in {channel: knots for (channel, _), knots in network.layout.table_knots.items()}.items():
+        samples = np.concatenate([r.values[channel] for r in records if channel in r.values] or [np.zeros(0)])
+        samples = samples[np.isfinite(samples)]
+        if samples.size == 0 or not levels:
+            continue
+        off = np.abs(samples[:, None] - np.array(levels)).min(axis=1) > OFF_LEVEL * np.ptp(samples)
+        if off.mean() > MOST_OFF:
+            said.append(
+                f"channel '{channel}' is declared with levels, but {off.mean():.0%} of its samples lie at none of the "
+                f"{len(levels)} that were found: if it changes continuously, declare knots instead"
+            )
+    return said
 
 
 def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:

@@ -22,7 +22,7 @@ from twin_core.calibrate.summary import to_model
 from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.calibrated import with_values
 from twin_core.network.dynamics import evaluate_balance, fill_boundaries
-from twin_core.network.model import build_network
+from twin_core.network.model import build_network, told_values
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
@@ -339,8 +339,9 @@ def _of_phase(spec: TwinSpec, phase: Phase, measured_K: FloatArray, predicted_K:
 
 def _rows(model: CalibratedModel, calibration: Calibration) -> list[Json]:
     """Return every parameter as it was declared and as it was correlated."""
-    declared = build_network(model.spec, table_knots=model.table_knots).parameters
-    stated = {p.name: p.value for p in declared.parameters if not p.guessed}
+    declared = build_network(model.spec, table_knots=model.table_knots)
+    values = told_values(declared)
+    stated = {p.name: values[p.name] for p in declared.parameters.parameters if not p.guessed}
     return [
         {
             "name": row["name"],

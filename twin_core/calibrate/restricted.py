@@ -266,9 +266,11 @@ def _told(left: Sequence[Leftover], prior: FloatArray, models: Sequence[Residual
 def told_directions(hessian: FloatArray, least: float) -> FloatArray:
     """Return combinations of unknowns that a Hessian tells independently and to one each, (n_unknowns, n_told).
 
-    Those that it tells less than ``least`` of what it tells the best, each unknown counted in its own unit, are left out.
+    Those that it tells less than ``least`` of what it tells the best, each unknown counted in its own unit, are left out, and
+    so is an unknown of which it tells nothing at all.
     """
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    told_of = np.diag(hessian)
+    scale = np.where(told_of > 0.0, 1.0 / np.sqrt(np.where(told_of > 0.0, told_of, 1.0)), 0.0)
     told, directions = np.linalg.eigh(hessian * scale[:, None] * scale)
     kept = told > least * told[-1]
     return np.asarray(scale[:, None] * directions[:, kept] / np.sqrt(told[kept]))

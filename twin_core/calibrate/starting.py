@@ -200,9 +200,9 @@ class Balance:
         known = self.columns[:, :, held] * start[held]
         rest, known_J2 = known.sum(axis=2), (known**2).sum(axis=2).mean(axis=0)
         own = self.columns[:, :, free]
-        # A signed heat has no logarithm: it counts in units of the heat that the other terms carry.
+        # A signed heat has no logarithm: it counts in units of the heat that the other terms carry. No logarithm needs a unit.
         unit = np.sqrt(max(float(((self.columns * start) ** 2).sum(axis=2).mean()), 1e-300))
-        size = np.maximum(np.sqrt((own**2).mean(axis=0)).max(axis=0), 1e-300)
+        size = np.where(logarithmic, unit, np.maximum(np.sqrt((own**2).mean(axis=0)).max(axis=0), 1e-300))
         x0 = np.where(logarithmic, np.log(np.where(logarithmic, start[free], 1.0)), start[free] * size / unit)
         std = np.array([TYPICAL_LOG_STD if items[i].guessed else items[i].prior_std or np.inf for i in free])
         std = np.where(logarithmic, std, 1e3)

@@ -9,14 +9,22 @@ from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.covariance import is_open_ended, noise_of_fit, trajectory_covariance
 from twin_core.calibrate.criteria import acceptance, with_met
-from twin_core.calibrate.identifiability import identified, resting_channels, strong_correlations, unseen_nodes, words
+from twin_core.calibrate.identifiability import (
+    blurred_levels,
+    identified,
+    resting_channels,
+    strong_correlations,
+    unseen_nodes,
+    untold_words,
+    words,
+)
 from twin_core.calibrate.optimise import ADVICE
 from twin_core.calibrate.restricted import ExpectedNoise, no_longer
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import residual_whiteness, score
 from twin_core.effects.base import Effect
-from twin_core.network.model import Network, build_network
+from twin_core.network.model import Network, build_network, told_values
 from twin_core.simulate.orbit_inputs import orbit_notices
 
 NO_COVARIANCE = "no uncertainty of the parameters is stated; forecasts carry only that of state and misfit"
@@ -87,21 +95,26 @@ def _summary(
 ) -> Json:
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
-    by_name: dict[str, float] = {}
+    untold = np.flatnonzero(np.diag(optimum.hessian)[: problem.n_free] <= 0.0)
+    by_name: dict[str, float | None] = {}
+    values = told_values(network)
     told: dict[str, bool] = {}
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
         stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        stds[untold] = np.inf
         for name in (f"{e.label}.{q.name}" for e in effects for q in e.parameter_specs() if q.open_ended):
             position = network.parameters.free_names.index(name)
             if is_open_ended(problem, optimum, position):
                 stds[position] = network.parameters.prior_std[position]
-        by_name = dict(zip(network.parameters.free_names, (stds * slopes).tolist(), strict=True))
+        finite = [std if np.isfinite(std) else None for std in (stds * slopes).tolist()]
+        by_name = dict(zip(network.parameters.free_names, finite, strict=True))
         told = identified(network.parameters, stds)
     fit = score(network.spec.sensors, [s.measured_K for s in problem.segments], list(optimum.fit.predicted_K))
     fit = with_met(network.spec, fit)
     first, last = problem.segments[0].record, problem.segments[-1].record
     heard = [n for s in problem.segments for n in s.record.notices]
+    heard += blurred_levels(network, [s.record for s in problem.segments])
     heard += orbit_notices(network.spec, [s.record for s in problem.segments])
     return {
         "train": {
@@ -120,7 +133,7 @@ def _summary(
             {
                 "name": p.name,
                 "unit": p.unit,
-                "mean": p.value,
+                "mean": values[p.name],
                 "std": by_name.get(p.name),
                 "identified": told.get(p.name),
                 "held": p.frozen,
@@ -131,6 +144,7 @@ def _summary(
         "words": [
             *unseen_nodes(network.spec, [e.where["nodes"] for e in effects if "nodes" in e.where]),
             *resting_channels(network.spec, [s.record for s in problem.segments]),
+            *untold_words(network, [s.record for s in problem.segments], untold),
             *([NO_COVARIANCE] if covariance is None else _words(calibration, covariance)),
         ],
         "correlations": [] if covariance is None else strong_correlations(network.parameters, covariance),

@@ -24,7 +24,7 @@ from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.starting import balance_starts
 from twin_core.calibrate.statistics import whiteness
 from twin_core.constants import ZERO_CELSIUS_K
-from twin_core.network.model import Network, build_network
+from twin_core.network.model import Network, build_network, told_values
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import dump_spec, load_spec
 from twin_core.parameters.parameter import NO_GUESS_LOG_STD
@@ -243,9 +243,14 @@ def _swaps(declared: Declared) -> Iterator[Variant]:
 
 def _held(declared: Declared) -> Iterator[Variant]:
     network = build_network(declared.spec, table_knots=declared.knots)
+    values = told_values(network)
+    columns = [column for record in declared.records for column in record.values.values()]
+    rests = all(np.ptp(column[np.isfinite(column)]) == 0.0 for column in columns if np.isfinite(column).any())
     for p in network.parameters.parameters:
+        if rests and p.unit == "J/K":  # what rests tells nothing of capacities
+            continue
         if p.frozen and is_logarithmic(p.transform):
-            words = f"{p.name}, held at {p.value:.3g} {p.unit}".rstrip() + ", is wrong"
+            words = f"{p.name}, held at {values[p.name]:.3g} {p.unit}".rstrip() + ", is wrong"
             yield Variant("held value", (p.name,), words, lambda: declared, p.name, 1)
     body = dump_spec(declared.spec)
     for name, boundary in declared.spec.boundaries.items():

@@ -48,7 +48,9 @@ class BoundaryMix(Effect):
         """Return the share of the channel, and the temperature of the rest, which any value stands for without it."""
         return (
             ParameterSpec("alpha", "", null=1.0, lower=0.0, upper=1.0),
-            ParameterSpec("T_w_K", "K", null=self.settings.get("T_ref_K", self.values["T_w_K"]), prior_std=50.0),
+            ParameterSpec(
+                "T_w_K", "K", null=self.settings.get("T_ref_K", self.values["T_w_K"]), prior_std=50.0, lower=0.0
+            ),
         )
 
     def addition(self, layout: Layout) -> Addition:

@@ -28,7 +28,7 @@ class ProportionalHeater(Effect):
         """Return gain, set-point and power limit."""
         return (
             ParameterSpec("k_W_per_K", "W/K", null=0.0, positive=True),
-            ParameterSpec("T_set_K", "K"),
+            ParameterSpec("T_set_K", "K", lower=0.0),
             ParameterSpec("Q_W", "W", positive=True, prior_std=3.0, open_ended=True),
         )
 

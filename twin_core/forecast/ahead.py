@@ -15,7 +15,7 @@ from twin_core.forecast.past import Missed, deviations_K, missed
 from twin_core.forecast.spread import Spread, spread
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.simulate.extrapolation import extrapolations, in_words
-from twin_core.simulate.forcing import build_forcing
+from twin_core.simulate.forcing import MOST_STEPS, build_forcing
 from twin_core.simulate.orbit_inputs import orbit_notices
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -107,7 +107,7 @@ def forecast(
         If horizon, step, inputs or a quantile is out of range, or the balance has no solution.
     """
     step = _sampling_s(record) if step_s is None else step_s
-    _check(horizon_s, step, quantiles)
+    _check(horizon_s, step, quantiles, model.max_step_s)
     network = model.network()
     values = network.parameters.values
     present_K, covariance_K2 = _present(model, record, state)
@@ -193,13 +193,18 @@ def _present(model: CalibratedModel, record: Record, state: Json | None) -> tupl
     return done.mean_K, done.covariance_K2
 
 
-def _check(horizon_s: float, step_s: float, quantiles: Sequence[float]) -> None:
+def _check(horizon_s: float, step_s: float, quantiles: Sequence[float], max_step_s: float) -> None:
     if not (np.isfinite(horizon_s) and horizon_s > 0):
         raise ModelError(f"horizon_s: must be a positive number of seconds (got {horizon_s})")
     if not (np.isfinite(step_s) and 0 < step_s <= horizon_s):
         raise ModelError(f"step_s: must be positive and at most the horizon (got {step_s})")
     if horizon_s / step_s > MAX_POINTS:
         raise ModelError(f"step_s: {horizon_s / step_s:.0f} points asked for, {MAX_POINTS} at most; take a longer step")
+    if horizon_s / max_step_s > MOST_STEPS:
+        raise ModelError(
+            f"horizon_s: {horizon_s:.4g} s are {horizon_s / max_step_s:.3g} steps of at most {max_step_s:.3g} s, as this network "
+            f"needs them; ask for {MOST_STEPS * max_step_s:.3g} s or less"
+        )
     wrong = [q for q in quantiles if not 0.0 < q < 1.0]
     if wrong:
         raise ModelError(f"quantiles: must lie between 0 and 1, exclusive (got {wrong[0]})")

@@ -98,7 +98,8 @@ def followed(
     drivers : name -> (n_points,)
         What it may follow; the phase of the period that tells most joins them.
     own_K, others_K : (n_points,), name -> (n_points,)
-        Temperatures of the node that receives the heat and of others: their difference drives every coupling.
+        Temperatures of the node that receives the heat, and of other nodes and boundaries: their difference drives every
+        coupling.
     """
     if own_K is not None:
         apart = {f"temperature of {name} over its own": other - own_K for name, other in (others_K or {}).items()}

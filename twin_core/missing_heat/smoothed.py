@@ -106,10 +106,11 @@ class NodeHeat:
         return apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
 
     def _following(self) -> str:
-        """Return what the swings follow, as a sentence."""
+        """Return in words what the swings follow; heat that several things drive together follows none of them alone."""
         what, share = next(iter(self.follows.items()), ("nothing", 0.0))
         if share < REPEATABLE:
-            return f"that variation follows nothing that is declared (at best {share:.0%} of it the {what})"
+            most = f" (at most {share:.0%} of it, the {what})" if share >= 0.01 else ""
+            return f"no temperature, difference of temperatures, channel or period by itself foretells that variation{most}"
         return f"{share:.0%} of that variation follows the {what}"
 
     def row(self) -> Json:
@@ -163,8 +164,8 @@ class MissingHeat:
         return [heat.row() for heat in self.heats]
 
     def words(self) -> list[str]:
-        """Return one sentence per node."""
-        return [heat.words() for heat in self.heats]
+        """Return one sentence per node; none of a node at which no heat at all is missing, as where nothing reaches it."""
+        return [heat.words() for heat in self.heats if heat.mean_W.any()]
 
 
 def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> MissingHeat:
@@ -205,9 +206,13 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
             continue
         said = None if effect is None or np.isnan(effect[:, at]).any() else effect[:, at]
         time_s = view.forcing.stage_time_s[:, 1]
-        drivers = {f"temperature of {node}": states[:, at], **view.drivers(search.base.fit.network)}
-        others = {name: states[:, i] for i, name in enumerate(search.base.fit.network.nodes) if i != at}
-        follows = followed(time_s, mean, drivers, own_K=states[:, at], others_K=others)
+        network = search.base.fit.network
+        boundaries = view.moving_boundaries_K(network)
+        drivers = {f"temperature of {name}": series for name, series in {node: states[:, at], **boundaries}.items()}
+        others = {name: states[:, i] for i, name in enumerate(network.nodes) if i != at}
+        follows = followed(
+            time_s, mean, {**drivers, **view.channels()}, own_K=states[:, at], others_K={**others, **boundaries}
+        )
         heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
     return MissingHeat(tuple(heats), tuple(notices))
 
@@ -245,12 +250,18 @@ class View:
         )
         return cls(window, first)
 
-    def drivers(self, network: Network) -> dict[str, FloatArray]:
-        """Return inputs, auxiliary channels and moving boundaries at the ends of the steps, by name, (n_steps,) each."""
+    def moving_boundaries_K(self, network: Network) -> dict[str, FloatArray]:
+        """Return the temperatures of boundaries that move, in K at the ends of the steps, by name, (n_steps,) each.
+
+        The difference to one that stands still tells nothing that the node's own temperature does not.
+        """
         ends = self.forcing.boundaries_K[:, 1]
-        moving = {f"temperature of {name}": ends[:, i] for i, name in enumerate(network.spec.boundaries)}
-        inputs = {f"channel {name}": series[:, 1] for name, series in self.forcing.inputs.items()}
-        return {name: column for name, column in (moving | inputs).items() if np.ptp(column) > 0.0}
+        return {name: ends[:, i] for i, name in enumerate(network.spec.boundaries) if np.ptp(ends[:, i]) > 0.0}
+
+    def channels(self) -> dict[str, FloatArray]:
+        """Return inputs and auxiliary channels that move, in SI at the ends of the steps, by name, (n_steps,) each."""
+        ends = {f"channel {name}": series[:, 1] for name, series in self.forcing.inputs.items()}
+        return {name: series for name, series in ends.items() if np.ptp(series) > 0.0}
 
     def turnover_W(self, network: Network, states_K: FloatArray) -> FloatArray:
         """Return the mean heat that passes through each node at the ends of the steps, (n_nodes,)."""

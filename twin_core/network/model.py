@@ -28,7 +28,14 @@ from twin_core.network.terms import (
     Term,
 )
 from twin_core.network.thermostat import Memory, ThermostatHeat
-from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD, Parameter, positive, real
+from twin_core.parameters.parameter import (
+    GUESS_LOG_STD,
+    NO_GUESS_LOG_STD,
+    Parameter,
+    absolute_temperature,
+    positive,
+    real,
+)
 from twin_core.parameters.vector import ParameterSet
 
 ARITHMETIC_S, ROOM_K = 1e-3, 293.0
@@ -311,7 +318,7 @@ def build_network(
     surroundings = tuple(sorted((b for a in additions for b in a.boundaries), key=lambda term: term.rank))
     parameters: list[Parameter] = [_capacity(spec, node) for node in spec.nodes]
     parameters += [
-        real(f"T:{name}", "K", b.guess_K, prior_std=b.spread or SINK_STD_K)
+        absolute_temperature(f"T:{name}", b.guess_K, prior_std_K=b.spread or SINK_STD_K)
         for name, b in spec.boundaries.items()
         if b.guess_K is not None
     ]
@@ -352,6 +359,12 @@ def _capacity(spec: TwinSpec, node: Node) -> Parameter:
     joined += [cube * guess_or(r.area_m2, 1e-3) for r in spec.radiation if node.id in r.between]
     joined += [cube * r.emissivity * r.area_m2 for r in spec.radiators if r.node == node.id]
     return positive(f"C:{node.id}", "J/K", ARITHMETIC_S * (sum(joined) or 1.0), frozen=True)
+
+
+def told_values(network: Network) -> dict[str, float]:
+    """Return name -> value of every parameter as it is told: 0 for a capacity declared as nothing, whatever stands for it."""
+    nothing = {f"C:{n.id}": 0.0 for n in network.spec.nodes if n.capacity_J_per_K and n.capacity_J_per_K.value == 0.0}
+    return network.parameters.as_dict() | nothing
 
 
 def declared_terms(layout: Layout) -> list[Term]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from twin_core.parameters.transforms import Identity, Log, LogInterval, Transform
+from twin_core.parameters.transforms import FROM_ZERO, Identity, Log, LogInterval, Transform
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,14 @@ def positive(
     """Return a parameter that is positive (and within ``bounds``) by construction."""
     transform: Transform = Log() if bounds is None else LogInterval(*bounds)
     return Parameter(name, unit, value, transform, prior_std, frozen, guessed)
+
+
+def absolute_temperature(name: str, value_K: float, *, prior_std_K: float) -> Parameter:
+    """Return a temperature that is not below absolute zero, with a Gaussian prior in K around its guess.
+
+    It may be absolute zero itself: what radiates nothing back.
+    """
+    return Parameter(name, "K", value_K, FROM_ZERO, prior_std_K)
 
 
 def real(name: str, unit: str, value: float, *, prior_std: float | None = None, frozen: bool = False) -> Parameter:

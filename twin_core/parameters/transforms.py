@@ -121,6 +121,10 @@ class Bounded:
         return 1.0
 
 
+FROM_ZERO = Bounded(0.0)
+"""A quantity that is not negative, whose size is known: an absolute temperature. It may be nothing at all."""
+
+
 @dataclass(frozen=True)
 class Log:
     """value = exp(free): a positive quantity of unknown order of magnitude, up to a bound if there is one."""

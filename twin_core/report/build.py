@@ -18,6 +18,7 @@ from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.discover.trial import mean_excess
 from twin_core.effects.base import Effect
 from twin_core.holdout import HeldOut, Prediction
+from twin_core.network.model import told_values
 from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out, sensitivity
 from twin_core.report.experiments import separating
 from twin_core.telemetry import Record
@@ -218,7 +219,8 @@ def unexplained_share(calibration: Calibration) -> float:
 def parameter_rows(search: Search, before: CalibratedModel, after: CalibratedModel) -> list[Json]:
     """Return every declared parameter as it was declared, calibrated, and corrected with the findings in place."""
     declared = search.base.fit.problem.network
-    guesses = stated_guesses(declared) | {p.name: p.value for p in declared.parameters.parameters if p.frozen}
+    values = told_values(declared)
+    guesses = stated_guesses(declared) | {p.name: values[p.name] for p in declared.parameters.parameters if p.frozen}
     corrected = {row["name"]: row for row in after.summary["parameters"]}
     return [
         {

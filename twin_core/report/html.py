@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 _FOLDER = Path(__file__).parent / "templates"
+_TITLE = "thermal model correlation"
 _BINS = 40
 _MOST_FLOWS = 60
 
@@ -44,6 +45,7 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
         report=report,
         plots=plots,
         version=__version__,
+        title=_TITLE,
         headline=phrasing.headline(report),
         gain=phrasing.gain(_rmse(report, "before"), _rmse(report, "after")),
         fell=_fell(report),
@@ -66,6 +68,11 @@ def render(report: Mapping[str, Any], plots: Mapping[str, Any]) -> str:
     )
 
 
+def is_report(page: str) -> bool:
+    """Return whether a text is a page that :func:`render` wrote."""
+    return page.lstrip().startswith("<!doctype html>") and f" – {_TITLE}</title>" in page
+
+
 @cache
 def _template() -> "Template":
     from jinja2 import Environment, FileSystemLoader
@@ -78,6 +85,7 @@ def _template() -> "Template":
         keep_trailing_newline=True,
     )
     for function in (
+        phrasing.ambiguities,
         phrasing.in_words,
         phrasing.instant,
         phrasing.kelvin,

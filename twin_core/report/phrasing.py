@@ -1,10 +1,11 @@
 """The verdict in words and numbers with units, for people."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from twin_core._typing import Json
+from twin_core.discover.policy import ALTERNATIVE_NATS
 
 _UNITS = {
     "_J_per_K": "J/K",
@@ -22,6 +23,8 @@ _UNITS = {
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 DECISIVE, STRONG = 5.0, 3.0
 """Log Bayes factors after Kass and Raftery, "Bayes factors", JASA 90 (1995): 5 is very strong, 3 strong."""
+MOST_NAMED = 3
+"""Alternatives that a sentence names; the report lists all."""
 
 
 def headline(report: Mapping[str, Any]) -> str:
@@ -98,6 +101,43 @@ def strength(log_bayes_factor: float | None) -> str:
 def in_words(effect: str) -> str:
     """Return the name of an effect as words."""
     return effect.replace("_", " ")
+
+
+def effect_in_words(effect: Mapping[str, Any]) -> str:
+    """Return an effect and its place: ``radiation to sink from box to bus``."""
+    return f"{in_words(str(effect.get('effect')))} {place(effect.get('where') or {})}".strip()
+
+
+def ambiguities(finding: Mapping[str, Any], name: Callable[[Mapping[str, Any]], str] = effect_in_words) -> list[str]:
+    """Return what cannot be told from a finding and why, as sentences without full stop.
+
+    Parameters
+    ----------
+    finding
+        Of a report.
+    name
+        How an alternative is called.
+    """
+    own = (finding.get("evidence") or {}).get("log_bayes_factor")
+    close: list[str] = []
+    coarse: list[str] = []
+    for other in finding.get("alternatives") or []:
+        factor = other.get("log_bayes_factor")
+        behind = 0.0 if own is None or factor is None else own - factor
+        (close if behind < ALTERNATIVE_NATS else coarse).append(name(other))
+    said = [f"The readings hardly tell it from {_first(close)}"] if close else []
+    if coarse:
+        explain = "this explains" if len(coarse) == 1 else "these explain"
+        said.append(f"The declared network is too coarse to tell it from {_first(coarse)}: {explain} nearly as much")
+    return said
+
+
+def _first(names: Sequence[str]) -> str:
+    """Return the first names of a list, joined, and how many others there are."""
+    shown, more = names[:MOST_NAMED], len(names) - MOST_NAMED
+    if more > 0:
+        return f"{', '.join(shown)} and {more} other{'s' if more > 1 else ''}"
+    return " or ".join(filter(None, (", ".join(shown[:-1]), shown[-1])))
 
 
 def label_in_words(label: str) -> str:

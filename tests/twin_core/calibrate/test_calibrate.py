@@ -146,11 +146,62 @@ def test_levels_of_a_table_are_read_from_the_telemetry() -> None:
     np.testing.assert_allclose(found, [0.0, 30.0, 12.0], atol=1.0)
 
 
+def test_a_node_that_stores_nothing_is_told_as_declared() -> None:
+    """What stands for a capacity of nothing in the arithmetic is told to nobody."""
+    data = declared()
+    data["nodes"].append({"id": "skin", "capacity_J_per_K": {"value": 0.0}})
+    data["conductors"].append({"between": ["a", "skin"], "conductance_W_per_K": {"value": 150.0}})
+    model = calibrate(load_spec(data), [telemetry()])
+    (row,) = [row for row in model.summary["parameters"] if row["name"] == "C:skin"]
+    assert row["mean"] == 0.0 and row["held"] and model.values["C:skin"] > 0.0
+
+
+def test_knots_that_the_channel_never_reaches_are_told() -> None:
+    """Half of the knots lie where the channel goes: what it does not visit has no uncertainty, and disturbs no other."""
+    data = declared()
+    data["channels"]["pitch"] = {"kind": "auxiliary"}
+    data["loads"].append({"channel": "pitch", "node": "a", "table": {"knots": [0.0, 10.0, 2e6, 3e6]}})
+    rng = np.random.default_rng(8)
+    time_s, heat = STEP_S * np.arange(400), heat_W(400, 8)
+    pitch = np.repeat(rng.uniform(0.0, 10.0, 40), 10)
+    read = exact_K(heat + 4.0 * pitch, time_s) + rng.normal(0.0, NOISE_K, (400, 2))
+    model = calibrate(load_spec(data), [record_of(time_s, Q=heat, pitch=pitch, T_a=read[:, 0], T_b=read[:, 1])])
+    rows = {row["name"]: row for row in model.summary["parameters"]}
+    found = [rows[f"table:pitch|a[{k}]"] for k in ("0", "10")]
+    np.testing.assert_allclose([row["mean"] for row in found], [0.0, 40.0], atol=1.0)
+    assert all(row["std"] < 1.0 for row in found)
+    for name in ("table:pitch|a[2e+06]", "table:pitch|a[3e+06]"):
+        assert rows[name]["std"] is None and rows[name]["identified"] is False
+        (told,) = [line for line in model.summary["words"] if name in line]
+        assert "never comes near that knot" in told and told.startswith(
+            f"the data do not determine {name}: channel 'pitch'"
+        )
+    assert np.abs(model.covariance).max() < 1.0
+
+
 def test_an_unknown_sink_is_found() -> None:
     data = declared()
     data["boundaries"]["room"] = {"guess_K": 270.0}
     model = calibrate(load_spec(data), [telemetry(600)])
     assert model.values["T:room"] == pytest.approx(ROOM_K, abs=1.0)
+
+
+def test_no_sink_is_colder_than_absolute_zero() -> None:
+    """The meter of the heat reads 400 W too much, all else is known: the sink that balances it lies 159 K below zero."""
+    data = declared()
+    data["boundaries"]["room"] = {"guess_K": 250.0}
+    for node, name in zip(data["nodes"], ("C:a", "C:b"), strict=True):
+        node["capacity_J_per_K"] = {"value": float(TRUTH[name])}
+    for conductor, name in zip(data["conductors"], ("G:a|b", "G:b|room"), strict=True):
+        conductor["conductance_W_per_K"] = {"value": TRUTH[name]}
+    data["loads"][0]["node"] = "b"
+    time_s = STEP_S * np.arange(300)
+    wrong = ROOM_K - 400.0 / WALL_W_PER_K
+    assert wrong < -100.0
+    read = exact_K(np.zeros(300), time_s) + np.random.default_rng(3).normal(0.0, NOISE_K, (300, 2))
+    model = calibrate(load_spec(data), [record_of(time_s, Q=np.full(300, 400.0), T_a=read[:, 0], T_b=read[:, 1])])
+    assert model.values["T:room"] == 0.0
+    assert "T:room ends at its bound of 0 K; the data pull below it" in model.summary["words"]
 
 
 def test_guesses_that_nobody_made_are_found_from_the_data() -> None:

@@ -1,9 +1,11 @@
 """What the data cannot see, in words."""
 
 import numpy as np
+import pytest
 
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.identifiability import (
+    blurred_levels,
     identified,
     resting_channels,
     strong_correlations,
@@ -12,8 +14,9 @@ from twin_core.calibrate.identifiability import (
     weakest_direction,
     words,
 )
+from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
-from twin_core.parameters.parameter import positive, real
+from twin_core.parameters.parameter import absolute_temperature, positive, real
 from twin_core.parameters.vector import ParameterSet
 
 SET = ParameterSet(
@@ -98,3 +101,56 @@ def test_channels_at_rest_are_said() -> None:
     (said,) = resting_channels(spec, [record])
     assert said.startswith("channel 'T0' never changes") and "stuck" in said
     assert resting_channels(spec, [record, record_of(time_s, T0=291.0, T1=290.0)]) == []
+
+
+BOUNDED = positive("C:b", "J/K", 100.0, bounds=(50.0, 200.0))
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "said"),
+    [
+        (199.9, 0.1, ["C:b ends at its bound of 200 J/K; the data pull above it: widen it if it is not known"]),
+        (50.1, 5.0, ["C:b ends at its bound of 50 J/K; the data pull below it: widen it if it is not known"]),
+        (150.0, 0.1, []),
+        (100.0, 5.0, ["the data do not determine C:b; it stays near its guess"]),
+    ],
+)
+def test_a_bound_that_the_data_pull_beyond_is_told(value: float, std: float, said: list[str]) -> None:
+    """The guess is the middle of the interval in ln: 1 % from an end is 6 standard deviations of its prior away, two thirds 1."""
+    assert words(ParameterSet((BOUNDED.at(value),)), np.array([[std**2]]), {"C:b": 100.0}) == said
+
+
+def test_bounds_that_leave_no_room_hold_what_the_data_do_not_tell() -> None:
+    tight = positive("C:b", "J/K", 100.0, bounds=(90.0, 110.0))
+    said = words(ParameterSet((tight,)), np.array([[25.0]]), {"C:b": 100.0})
+    assert said == [
+        "the data do not determine C:b; its bounds of 90 to 110 J/K hold it: widen them if they are not known"
+    ]
+
+
+def test_a_guess_near_its_bound_is_not_pulled_there() -> None:
+    near = positive("C:b", "J/K", 198.0, bounds=(50.0, 200.0))
+    assert words(ParameterSet((near,)), np.array([[0.01]]), {"C:b": 198.0}) == []
+
+
+def test_a_sink_is_told_by_its_own_size() -> None:
+    sink = ParameterSet((absolute_temperature("T:sink", 250.0, prior_std_K=50.0),))
+    assert unseen_parameters(sink, np.array([40.0])) == [] and unseen_parameters(sink, np.array([300.0])) == ["T:sink"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "told"),
+    [
+        (np.linspace(0.0, 10.0, 101), True),  # continuous: only what lies at an end is at a level
+        (np.repeat([0.0, 10.0], 50), False),
+        (np.concatenate([np.repeat([0.0, 10.0], 50), [2.0, 5.0, 8.0]]), False),  # a slew
+    ],
+)
+def test_a_continuous_channel_has_no_levels(mode: np.ndarray, told: bool) -> None:
+    data = conductive_spec(1, [], channels={"mode": {"kind": "auxiliary", "levels": True}})
+    data["loads"] = [{"channel": "mode", "node": "n0", "table": {}}]
+    network = build_network(load_spec(data), table_knots={("mode", "n0"): (0.0, 10.0)})
+    said = blurred_levels(network, [record_of(np.arange(float(mode.size)), mode=mode)])
+    assert [line.startswith("channel 'mode' is declared with levels, but 94% of its samples") for line in said] == [
+        True
+    ] * told

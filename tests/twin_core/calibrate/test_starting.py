@@ -193,3 +193,23 @@ def test_the_temperature_lab_starts_from_a_guessed_gain_alone(run: str) -> None:
     assert abs(np.log(gain / 0.032)) < 1.0  # the guess sets the scale, within its spread
     assert 0.5 < model.values["C:a"] / gain / (6.0 / 0.032) < 2.0  # published: 6 J/K at 0.032 W/%
     assert 0.5 < model.values["G:a|room"] / gain / (0.042 / 0.032) < 2.0  # published: 0.042 W/K
+
+
+def test_a_coupling_that_no_temperature_drives_disturbs_no_balance() -> None:
+    """A hidden node hangs on a chain of large heats, so that it reads as its neighbour: their coupling tells nothing.
+
+    Warnings are errors: nothing may overflow. The chain starts where it would, the coupling at what nobody guessed.
+    """
+    data = chain_network()
+    data["nodes"].append({"id": "pocket", "capacity_J_per_K": {"guess": 3e9}})
+    data["conductors"].append({"between": ["n2", "pocket"]})
+    capacity, conductance = np.full(3, 1e10), [2e7, 3e7]
+    time_s = 60.0 * np.arange(200.0)
+    heat = np.repeat(np.random.default_rng(2).choice([0.0, 3e8], 20), 10)
+    rates = -laplacian(3, [(0, 1), (1, 2)], conductance) / capacity[:, None]
+    read = linear_states(rates, np.outer(heat, [1.0 / capacity[0], 0.0, 0.0]), np.full(3, 280.0), time_s)
+    record = record_of(time_s, Q=heat, **{f"T{k}": read[:, k] for k in range(3)})
+    found = balance_start(build_problem(build_network(load_spec(data)), [record], np.full(3, 0.01))).as_dict()
+    for name, value in {"C:n0": 1e10, "C:n1": 1e10, "G:n0|n1": 2e7, "G:n1|n2": 3e7}.items():
+        assert abs(np.log(found[name] / value)) < np.log(3.0), name
+    assert 0.0 < found["G:n2|pocket"] < np.inf

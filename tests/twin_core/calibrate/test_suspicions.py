@@ -263,3 +263,20 @@ def test_many_records_are_thinned_as_one_is(lengths: tuple[int, ...]) -> None:
 def test_each_possible_mistake_is_made_only_when_asked_for() -> None:
     """Of a network of 200 nodes there are 40,000: none of them is built to be counted."""
     assert len(variants(row(200))) == 2 * 19_900 - 199 + 99
+
+
+@pytest.mark.parametrize("rests", [True, False])
+def test_readings_at_rest_put_no_capacity_in_doubt(rests: bool) -> None:
+    """A conductance that is held may be wrong either way."""
+    spec = {
+        "twin": "pair",
+        "boundaries": {"room": {"channel": "T_room"}},
+        "channels": {name: {"kind": "temperature", "unit": "K"} for name in ("T_a", "T_room")},
+        "nodes": [{"id": "a", "sensor": "T_a", "capacity_J_per_K": {"value": 900.0}}],
+        "conductors": [{"between": ["a", "room"], "conductance_W_per_K": {"value": 1.0}}],
+    }
+    swing_K = 0.0 if rests else 1.0
+    columns = {"T_a": 290.0 + swing_K * np.arange(9.0), "T_room": np.full(9, 285.0)}
+    declared = Declared(load_spec(spec), (record_of(60.0 * np.arange(9), **columns),), np.array([0.1]))
+    held_values = {v.where[0] for v in variants(declared) if v.mistake == "held value"}
+    assert held_values == ({"G:a|room"} if rests else {"G:a|room", "C:a"})

@@ -1,5 +1,7 @@
 """The smoothed heat is the one that SciPy put in, is told in figures and words, and never stands in the way."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -111,6 +113,23 @@ def _heat(effect_W, mean_W, std_W=0.5) -> NodeHeat:
     return NodeHeat("n", steps, 280.0 + steps, mean_W * np.ones(50), std_W * np.ones(50), full, None, 10.0, {})
 
 
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [
+        (0.0, "by itself foretells that variation."),
+        (0.3, "by itself foretells that variation (at most 30% of it, the channel Q)."),
+        (0.8, "80% of that variation follows the channel Q."),
+    ],
+)
+def test_what_a_heat_follows_is_told_as_far_as_it_was_looked_for(share, words):
+    assert replace(_heat(None, 4.0), follows={"channel Q": share}).words().endswith(words)
+
+
+def test_nothing_is_said_of_a_node_that_lacks_nothing():
+    told = module.MissingHeat((_heat(None, 0.0), _heat(None, 4.0)))
+    assert len(told.words()) == 1 and "lacks 4 W" in told.words()[0] and len(told.rows()) == 2
+
+
 WAVE = np.sin(np.arange(50.0) / 5.0)
 
 
@@ -148,3 +167,29 @@ def test_forces_that_are_not_finite_are_left_out(search, monkeypatch):
     told = smooth_missing_heat(search)
     assert len(told.heats) == 1 and any("not finite" in notice for notice in told.notices)
     assert told.heats[0].node == "b"
+
+
+def test_a_leak_to_a_boundary_follows_what_drives_it():
+    """SciPy lets b leak 0.4 W/K into a wall whose channel is read; all else is known, so that nothing takes it up."""
+    wall = 285.0 + 9.0 * np.sin(2.0 * np.pi * TIMES / 5100.0) + 4.0 * np.sin(2.0 * np.pi * TIMES / 1900.0)
+
+    def rates(t, x):
+        exchange, leak = 1.5 * (x[1] - x[0]), 0.4 * (np.interp(t, TIMES, wall) - x[1])
+        radiated = SIGMA * 0.8 * 0.2 * (3.0**4 - x[1] ** 4)
+        return [(np.interp(t, TIMES, POWER) + exchange) / 800.0, (-exchange + radiated + leak) / 2000.0]
+
+    run = solve_ivp(rates, TIMES[[0, -1]], [265.0, 255.0], t_eval=TIMES, rtol=1e-9, atol=1e-9, max_step=100.0)
+    noisy = run.y.T + np.random.default_rng(5).normal(0.0, 0.02, (TIMES.size, 2))
+    known = {
+        "boundaries": SPEC["boundaries"] | {"wall": {"channel": "T_wall"}},
+        "channels": SPEC["channels"] | {"T_wall": {"kind": "temperature", "unit": "K"}},
+    }
+    record = Record(TIMES, {"T_a": noisy[:, 0], "T_b": noisy[:, 1], "Q": POWER, "T_wall": wall})
+    fit, calibration = fit_network(load_spec(SPEC | known), [record])
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    heat = next(h for h in smooth_missing_heat(Search(base, base)).heats if h.node == "b")
+    truth = 0.4 * (np.interp(heat.time_s, TIMES, wall) - heat.temperature_K)
+    assert np.corrcoef(truth, heat.mean_W)[0, 1] > 0.95
+    what, share = next(iter(heat.follows.items()))
+    assert what == "temperature of wall over its own" and share > 0.9
+    assert f"{share:.0%} of that variation follows the {what}" in heat.words()

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from twin_core.parameters.parameter import GUESS_LOG_STD, positive, real
+from twin_core.parameters.parameter import GUESS_LOG_STD, absolute_temperature, positive, real
 from twin_core.parameters.transforms import Identity, Log, LogInterval
 
 
@@ -33,3 +33,10 @@ def test_at_changes_the_value_alone() -> None:
     moved = parameter.at(7.0)
     assert (moved.value, moved.name, moved.frozen, moved.guessed) == (7.0, "C:a", True, True)
     assert parameter.value == 1.0
+
+
+def test_an_absolute_temperature_counts_in_kelvin_down_to_zero() -> None:
+    """Its prior is the Gaussian that was declared; a step below absolute zero ends there."""
+    parameter = absolute_temperature("T:sink", 3.0, prior_std_K=1.0)
+    assert (parameter.free, parameter.prior_std, parameter.transform.lowest) == (3.0, 1.0, 0.0)
+    assert [parameter.transform.to_value(free) for free in (250.0, 3.0, -90.0)] == [250.0, 3.0, 0.0]

@@ -114,6 +114,12 @@ def test_what_would_tell_a_finding_from_its_alternatives(experiments: list[bool]
     assert "warm it 1" not in text
 
 
+def test_the_page_tells_why_a_finding_is_ambiguous() -> None:
+    text = Page(render(example_report(), example_plots())).text  # 19.4 nats behind
+    assert "too coarse to tell it from leak to boundary from px to bus: this explains nearly as much." in text
+    assert "hardly tell" not in text
+
+
 def test_nothing_is_loaded_from_elsewhere() -> None:
     page = render(example_report(), example_plots())
     assert Page(page).loaded == ["data:,"]

@@ -124,3 +124,40 @@ def test_strength(factor: float, word: str) -> None:
 def test_labels_keep_names() -> None:
     assert phrasing.label_in_words("input_gain(Q_box)") == "input gain (Q_box)"
     assert phrasing.label_in_words("input_gain") == "input gain"
+
+
+def _among(*factors: float | None) -> dict[str, Any]:
+    others = [{"effect": "heat_leak", "where": {"node": f"n{k}"}, "log_bayes_factor": f} for k, f in enumerate(factors)]
+    return {"evidence": {"log_bayes_factor": 100.0}, "alternatives": others}
+
+
+CLOSE, COARSE = "The readings hardly tell it from", "The declared network is too coarse to tell it from"
+
+
+@pytest.mark.parametrize(
+    ("factors", "said"),
+    [
+        ((), []),
+        ((97.5,), [f"{CLOSE} heat leak at n0"]),
+        ((104.0, 99.0), [f"{CLOSE} heat leak at n0 or heat leak at n1"]),
+        ((20.0,), [f"{COARSE} heat leak at n0: this explains nearly as much"]),
+        (
+            (99.0, 40.0, 5.0),
+            [
+                f"{CLOSE} heat leak at n0",
+                f"{COARSE} heat leak at n1 or heat leak at n2: these explain nearly as much",
+            ],
+        ),
+        ((99.0,) * 3, [f"{CLOSE} heat leak at n0, heat leak at n1 or heat leak at n2"]),
+        ((99.0,) * 4, [f"{CLOSE} heat leak at n0, heat leak at n1, heat leak at n2 and 1 other"]),
+        (
+            (9.0,) * 20,
+            [
+                f"{COARSE} heat leak at n0, heat leak at n1, heat leak at n2 and 17 others: these explain nearly as much",
+            ],
+        ),
+    ],
+)
+def test_why_a_finding_is_ambiguous_is_told(factors: tuple[float, ...], said: list[str]) -> None:
+    """Three nats are what readings hardly tell; what is farther behind explains nearly as much in a coarse network."""
+    assert phrasing.ambiguities(_among(*factors)) == said
