@@ -129,14 +129,17 @@ class NodeHeat:
             "follows": [{"what": what, "share": share} for what, share in self.follows.items()],
         }
 
-    def words(self) -> str:
-        """Return what it says in a few sentences."""
+    def words(self, *, no_heat: bool = False) -> str:
+        """Return what it says in a few sentences; ``no_heat``: what was found supplies none, such as a sensor that lags."""
         mean, swing = self.mean_W.mean(), self.mean_W.std()
+        band = f"(uncertainty {self.band_W:.2g} W)"
+        if no_heat:
+            return (
+                f"Were what the readings at {self.node} show a heat, it would be {mean:.3g} W on average and vary by "
+                f"{swing:.2g} W {band}; what was found explains the readings without one."
+            )
         lacks = f"lacks {mean:.3g} W at {self.node}" if mean >= 0.0 else f"has {-mean:.3g} W too much at {self.node}"
-        seen = (
-            f"The declared model {lacks} on average; this varies by {swing:.2g} W (uncertainty {self.band_W:.2g} W), and "
-            f"{self._following()}."
-        )
+        seen = f"The declared model {lacks} on average; this varies by {swing:.2g} W {band}, and {self._following()}."
         if self.effect_W is None:
             return seen
         supplied = self.effect_W.mean()
@@ -154,10 +157,11 @@ class NodeHeat:
 
 @dataclass(frozen=True)
 class MissingHeat:
-    """The nodes of interest, and what could not be told, in words."""
+    """The nodes of interest, what could not be told, in words, and whether what was found supplies no heat at any node."""
 
     heats: tuple[NodeHeat, ...]
     notices: tuple[str, ...] = ()
+    no_heat: bool = False
 
     def rows(self) -> list[Json]:
         """Return the figures for a report, one row per node."""
@@ -165,7 +169,7 @@ class MissingHeat:
 
     def words(self) -> list[str]:
         """Return one sentence per node; none of a node at which no heat at all is missing, as where nothing reaches it."""
-        return [heat.words() for heat in self.heats if heat.mean_W.any()]
+        return [heat.words(no_heat=self.no_heat) for heat in self.heats if heat.mean_W.any()]
 
 
 def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> MissingHeat:
@@ -214,7 +218,8 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
             time_s, mean, {**drivers, **view.channels()}, own_K=states[:, at], others_K={**others, **boundaries}
         )
         heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
-    return MissingHeat(tuple(heats), tuple(notices))
+    no_heat = bool(search.findings) and not (effect is not None and np.nan_to_num(effect).any())
+    return MissingHeat(tuple(heats), tuple(notices), no_heat)
 
 
 def added_to_report(missing: MissingHeat, report: Json) -> Json:

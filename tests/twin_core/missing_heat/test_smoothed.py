@@ -80,6 +80,18 @@ def test_without_findings_there_is_nothing_to_agree_with(search):
     assert added["notices"] == ["old"] and report["words"] == ["before"]
 
 
+@pytest.mark.parametrize(
+    ("heat_W", "words"), [(np.nan, "Were what the readings at b show"), (4.0, "The declared model lacks")]
+)
+def test_where_what_was_found_supplies_no_heat_none_is_said_to_be_missing(search, monkeypatch, heat_W, words):
+    """A sensor that lagged stood beside 4.3 W that a heater of 3.2 W was said to lack."""
+    monkeypatch.setattr(module, "nodes_of_interest", lambda search: ["b"])
+    monkeypatch.setattr(module, "effect_heat", lambda search, states, first: np.full_like(states, heat_W))
+    told = smooth_missing_heat(replace(search, findings=["what a sensor does"]))
+    assert len(told.words()) == 1
+    assert told.words()[0].startswith(words)
+
+
 def test_long_records_are_seen_from_their_end(search, monkeypatch):
     whole = {heat.node: heat for heat in smooth_missing_heat(search).heats}
     monkeypatch.setattr(module, "MAX_WORK", 16.0 * 200)
