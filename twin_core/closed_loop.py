@@ -25,10 +25,9 @@ from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
-from twin_core.network.screened import screened
+from twin_core.network.screened import screened, segments
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
-from twin_core.quality.gaps import segmented
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
 from twin_core.report.mistakes import told_mistakes
@@ -219,9 +218,9 @@ def _split(
     """Return the training records and the hold-out; TelemetryError where there is nothing to score."""
     if not records:
         raise TelemetryError("no telemetry given")
-    records = segmented(records, spec.driving_channels, spec.held_inputs)
+    records = segments(spec, records)
     if holdout_records:
-        separate = segmented(holdout_records, spec.driving_channels, spec.held_inputs)
+        separate = segments(spec, holdout_records)
         train, held = list(records), [split_burn_in(record, burn_in_s) for record in separate]
     else:
         train, held = split_fraction(records, 0.3 if holdout is None else holdout)

@@ -9,6 +9,7 @@ from twin_core._typing import BoolArray
 from twin_core.network.doubts import doubts
 from twin_core.network.spec import Interval, TwinSpec
 from twin_core.quality import masked
+from twin_core.quality.gaps import segmented
 from twin_core.telemetry import Record
 
 
@@ -36,3 +37,8 @@ def screened(spec: TwinSpec, record: Record) -> Record:
     ignored = dict.fromkeys(spec.sensors, excluded(record, spec.exclude))
     clean = masked(record, units, ignored, spec.driving_channels)
     return replace(clean, notices=tuple(dict.fromkeys([*clean.notices, *doubts(spec, clean)])))
+
+
+def segments(spec: TwinSpec, records: Sequence[Record]) -> list[Record]:
+    """Return records cut at every gap, and without every lapse of an input, that no fit or prediction is to step through."""
+    return segmented(records, spec.driving_channels, spec.held_inputs, spec.balance_channels)

@@ -294,7 +294,7 @@ def build_report(
             *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),
-            *before.summary["notices"],
+            *dict.fromkeys([*before.summary["notices"], *(notice for h in held for notice in h.scored.notices)]),
             *(notice for p in predictions[1] for notice in p.notices),
         ],
     }
