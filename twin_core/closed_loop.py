@@ -25,7 +25,7 @@ from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
-from twin_core.network.screened import screened, segments
+from twin_core.network.screened import all_screened, segments
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
 from twin_core.report.build import build_report
@@ -114,8 +114,8 @@ def close_loop(
     # The search ends at the deadline; what only illustrates its findings has a little longer.
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
-        records = [screened(spec, record) for record in records]
-        holdout_records = [screened(spec, record) for record in holdout_records or ()]
+        records = all_screened(spec, records)
+        holdout_records = all_screened(spec, holdout_records or ())
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
         check_moments(train, moments)
         fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))

@@ -16,7 +16,7 @@ from twin_core.calibrate.summary import stated_guesses, to_model
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.errors import NoSolutionError
 from twin_core.network.model import build_network
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
@@ -63,7 +63,7 @@ def explained(model: CalibratedModel, calibration: Calibration, *, deadline: flo
 
 def _advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: float) -> str:
     """Return the error with the mistakes that would have a solution."""
-    seen = [screened(spec, record) for record in records]
+    seen = all_screened(spec, records)
     network = build_network(spec, table_knots=table_levels(spec, seen))
     problem = build_problem(network, seen, sensor_noise_K(spec, seen))
     looked = suspicions(declared_of(problem), deadline=deadline)
