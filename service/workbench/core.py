@@ -169,7 +169,7 @@ class CoreWorkbench:
             step_s=task.step_s,
             plan=None if task.plan is None else _record(spec, task.plan),
             inputs=task.inputs,
-            past=None if task.past is None else _record(spec, task.past),
+            past=None if task.past is None else _screened(spec, task.past)[0],
             quantiles=task.quantiles,
             state=task.state,
         )
