@@ -225,9 +225,9 @@ def _split(
     else:
         train, held = split_fraction(records, 0.3 if holdout is None else holdout)
     if not any(np.isfinite(measured_temperatures(spec, h.scored)[1:]).any() for h in held):
-        sensors = ", ".join(spec.sensors)
         raise TelemetryError(
-            f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
+            f"{held[0].scored.name}: the hold-out has no usable sample of {', '.join(spec.sensors)}; nothing can be scored"
+            f"{_masked_there(spec, held)}"
         )
     given = {b.channel for b in spec.boundaries.values() if b.channel is not None} | {
         load.channel for load in spec.loads
@@ -240,6 +240,20 @@ def _split(
                     " choose another hold-out, or give them"
                 )
     return train, held
+
+
+def _masked_there(spec: TwinSpec, held: Sequence[HeldOut]) -> str:
+    """Return why readings of the hold-out were left out, in words; empty where none were."""
+    reasons = {
+        (flaw.channel, flaw.reason): None
+        for h in held
+        for flaw in h.scored.flaws or ()
+        if flaw.channel in spec.sensors and flaw.stop_s > h.scored.time_s[0] and flaw.start_s <= h.scored.time_s[-1]
+    }
+    if not reasons:
+        return ""
+    told = ", ".join(f"{channel} as {reason}" for channel, reason in reasons)
+    return f": readings of {told} were left out there; choose another hold-out, or keep them (no masking) if they are sound"
 
 
 def verdict_of(found: Search) -> str:

@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import Progress
 from twin_core.calibrate.containment import NO_DEADLINE
+from twin_core.calibrate.identifiability import nothing_moves
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.result import CalibratedModel
@@ -46,11 +47,13 @@ def calibrate_and_explain(
 
 
 def explained(model: CalibratedModel, calibration: Calibration, *, deadline: float = NO_DEADLINE) -> CalibratedModel:
-    """Return a model with words on what an odd fit usually means; itself where nothing is odd."""
+    """Return a model with words on what an odd fit usually means; itself where nothing is odd, or no sensor ever changes."""
     problem, parameters = calibration.problem, calibration.network.parameters
     guesses = stated_guesses(problem.network)
     misfit = float(np.sqrt(np.nanmean(np.concatenate(calibration.residuals) ** 2 / problem.noise_K**2)))
-    if not is_odd(parameters, guesses, misfit):
+    if nothing_moves(problem.network.spec, [s.record for s in problem.segments]) or not is_odd(
+        parameters, guesses, misfit
+    ):
         return model
     looked = suspicions(declared_of(problem), parameters.as_dict(), deadline=deadline)
     told = model.summary["words"]
