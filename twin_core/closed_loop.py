@@ -253,7 +253,9 @@ def _masked_there(spec: TwinSpec, held: Sequence[HeldOut]) -> str:
     if not reasons:
         return ""
     told = ", ".join(f"{channel} as {reason}" for channel, reason in reasons)
-    return f": readings of {told} were left out there; choose another hold-out, or keep them (no masking) if they are sound"
+    return (
+        f", since readings there were masked: {told}; choose another hold-out, or switch masking off if they are sound"
+    )
 
 
 def verdict_of(found: Search) -> str:
