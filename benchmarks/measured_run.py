@@ -24,8 +24,7 @@ from benchmarks.measured_splits import ROOT, SPLITS, Prepared, Split
 from benchmarks.network_cases import network_case
 from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.holdout import predict, split_burn_in
-from twin_core.network.screened import screened
-from twin_core.quality.gaps import segmented
+from twin_core.network.screened import screened, segments
 from twin_core.telemetry import Record
 
 GRACE_S = 60.0
@@ -179,7 +178,7 @@ def _rmse_K(errors: Sequence[np.ndarray[Any, Any]]) -> float:
 def _pair(loop: ClosedLoop, prepared: Prepared, record: Record) -> Pair:
     """Return the held-out errors of one record of the hold-out."""
     try:
-        parts = segmented([screened(prepared.spec, record)], prepared.spec.driving_channels, prepared.spec.held_inputs)
+        parts = segments(prepared.spec, [screened(prepared.spec, record)])
         held = [split_burn_in(part, prepared.burn_in_s) for part in parts]
         errors = [
             _rmse_K([done.measured_K - done.predicted_K for done in (predict(model, h) for h in held)])

@@ -26,10 +26,9 @@ from twin_core.errors import ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened, segments
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
-from twin_core.quality.gaps import segmented
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
 from twin_core.report.mistakes import told_mistakes
@@ -118,8 +117,8 @@ def close_loop(
     # The search ends at the deadline; what only illustrates its findings has a little longer.
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
-        records = [screened(spec, record) for record in records]
-        holdout_records = [screened(spec, record) for record in holdout_records or ()]
+        records = all_screened(spec, records)
+        holdout_records = all_screened(spec, holdout_records or ())
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
         check_moments(train, moments)
         fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
@@ -222,16 +221,16 @@ def _split(
     """Return the training records and the hold-out; TelemetryError where there is nothing to score."""
     if not records:
         raise TelemetryError("no telemetry given")
-    records = segmented(records, spec.driving_channels, spec.held_inputs)
+    records = segments(spec, records)
     if holdout_records:
-        separate = segmented(holdout_records, spec.driving_channels, spec.held_inputs)
+        separate = segments(spec, holdout_records)
         train, held = list(records), [split_burn_in(record, burn_in_s) for record in separate]
     else:
         train, held = split_fraction(records, 0.3 if holdout is None else holdout)
     if not any(np.isfinite(measured_temperatures(spec, h.scored)[1:]).any() for h in held):
-        sensors = ", ".join(spec.sensors)
         raise TelemetryError(
-            f"{held[0].scored.name}: the hold-out has no usable sample of {sensors}; nothing can be scored"
+            f"{held[0].scored.name}: the hold-out has no usable sample of {', '.join(spec.sensors)}; nothing can be scored"
+            f"{_masked_there(spec, held)}"
         )
     given = {b.channel for b in spec.boundaries.values() if b.channel is not None} | {
         load.channel for load in spec.loads
@@ -244,6 +243,22 @@ def _split(
                     " choose another hold-out, or give them"
                 )
     return train, held
+
+
+def _masked_there(spec: TwinSpec, held: Sequence[HeldOut]) -> str:
+    """Return why readings of the hold-out were left out, in words; empty where none were."""
+    reasons = {
+        (flaw.channel, flaw.reason): None
+        for h in held
+        for flaw in h.scored.flaws or ()
+        if flaw.channel in spec.sensors and flaw.stop_s > h.scored.time_s[0] and flaw.start_s <= h.scored.time_s[-1]
+    }
+    if not reasons:
+        return ""
+    told = ", ".join(f"{channel} as {reason}" for channel, reason in reasons)
+    return (
+        f", since readings there were masked: {told}; choose another hold-out, or switch masking off if they are sound"
+    )
 
 
 def verdict_of(found: Search) -> str:

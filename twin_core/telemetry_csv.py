@@ -211,14 +211,19 @@ def _seconds(table: CsvTable) -> FloatArray:
 
 
 def _in_si(table: CsvTable, name: str, channel: Channel, column: FloatArray) -> FloatArray:
-    """Return one channel in SI, plausible everywhere."""
+    """Return one channel in SI, plausible everywhere but for markers of missing samples."""
     values = to_si(column, channel.unit)
-    fault = implausible(channel, np.where(marked(values, channel.unit), np.nan, values))
+    refuse_implausible(table, name, channel, np.where(marked(values, channel.unit), np.nan, column))
+    return values
+
+
+def refuse_implausible(table: CsvTable, name: str, channel: Channel, column: FloatArray) -> None:
+    """Refuse a column, in the channel's own unit, that holds what no instrument reads; TelemetryError names the row."""
+    fault = implausible(channel, to_si(column, channel.unit))
     if fault is not None:
         row, problem = fault
         unit = f" {channel.unit}" if channel.unit else ""
         table.refuse(row, name, f"holds {column[row]:g}{unit}, which {problem}")
-    return values
 
 
 __all__ = [
@@ -227,6 +232,7 @@ __all__ = [
     "present_channels",
     "read_csv",
     "read_segments",
+    "refuse_implausible",
     "write_columns",
     "write_csv",
 ]

@@ -130,6 +130,7 @@ def balance_phases(path: Path, spec: "TwinSpec", transients: "list[Record]") -> 
     from twin_core.calibrate.phases import at_rest, weight_of
     from twin_core.csv_table import open_table
     from twin_core.errors import TelemetryError
+    from twin_core.telemetry_csv import refuse_implausible
     from twin_core.units import parse_instant_ns
 
     table = open_table(path)
@@ -137,6 +138,8 @@ def balance_phases(path: Path, spec: "TwinSpec", transients: "list[Record]") -> 
         raise TelemetryError(f"{path}: has no column '{PHASE}' that names its rows")
     names = table.texts(PHASE)
     columns = table.numbers([name for name in table.header if name in spec.channels])
+    for channel, column in columns.items():
+        refuse_implausible(table, channel, spec.channels[channel], column)
     dates = table.texts("time") if "time" in table.header else [""] * len(names)
     dated = bool(transients) and transients[0].epoch_ns is not None
     found = []

@@ -64,7 +64,7 @@ def forecast(
     if len(telemetry) > 1:
         raise TelemetryError(f"{telemetry[1]}: a forecast starts at the end of one file; name one")
     model = load_model(model_file)
-    record = load_segments(telemetry[0], model.spec, masking=not no_masking)[-1]
+    record = load_segments(telemetry[:1], model.spec, masking=not no_masking)[-1]
     if step is None and record.time_s.size < 2:
         raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
     planned = _load_plan(plan, record, model, horizon) if plan else None

@@ -13,7 +13,7 @@ from replay.mapping import apply_mapping, map_topics
 from replay.mcap_io import read_mcap, read_mcap_segments, write_mcap
 from replay.recording import Recording
 from twin_core.errors import TelemetryError
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
 from twin_core.quality import unmasked
 from twin_core.quality.sentinels import marked
@@ -45,13 +45,13 @@ def load_record(path: Path, spec: TwinSpec, *, required: Collection[str] | None 
     return _from_recording(path, read_mcap(path), spec, required)
 
 
-def load_segments(path: Path, spec: TwinSpec, *, masking: bool = True) -> list[Record]:
-    """Read one telemetry file, CSV or MCAP, as segments: a new one begins where the clock jumps back.
+def load_segments(paths: Sequence[Path], spec: TwinSpec, *, masking: bool = True) -> list[Record]:
+    """Read telemetry files, CSV or MCAP, as segments: a new one begins with each file, and where the clock jumps back.
 
     Parameters
     ----------
-    path
-        A file ending in .csv or .mcap.
+    paths
+        Files ending in .csv or .mcap.
     spec
         Declares channels and units; the topics of an MCAP file are matched by name or by their last part.
     masking
@@ -62,19 +62,24 @@ def load_segments(path: Path, spec: TwinSpec, *, masking: bool = True) -> list[R
     TelemetryError, RecordingError
         With one line naming the file and what is wrong.
     """
-    check_suffix(path)
-    if path.suffix == ".csv":
-        segments = read_segments(path, spec)
-    else:
-        segments = [_from_recording(path, part, spec, None) for part in read_mcap_segments(path)]
-        if len(segments) > 1:
-            said = f"{path}: the clock jumps back {len(segments) - 1} time(s); a new segment begins at each"
-            segments[0] = replace(segments[0], notices=(*segments[0].notices, said))
+    segments = [segment for path in paths for segment in _segments_of(path, spec)]
     if masking:
-        return [screened(spec, segment) for segment in segments]
+        return all_screened(spec, segments)
     for segment in segments:
         _check_plausible(spec, segment)
     return [unmasked(segment) for segment in segments]
+
+
+def _segments_of(path: Path, spec: TwinSpec) -> list[Record]:
+    """Read one file as it is."""
+    check_suffix(path)
+    if path.suffix == ".csv":
+        return read_segments(path, spec)
+    segments = [_from_recording(path, part, spec, None) for part in read_mcap_segments(path)]
+    if len(segments) > 1:
+        said = f"{path}: the clock jumps back {len(segments) - 1} time(s); a new segment begins at each"
+        segments[0] = replace(segments[0], notices=(*segments[0].notices, said))
+    return segments
 
 
 def _check_plausible(spec: TwinSpec, record: Record) -> None:
@@ -97,7 +102,7 @@ def load_records(paths: Sequence[Path], spec: TwinSpec, *, masking: bool = True)
     for position, path in enumerate(paths):
         if path.resolve() in [earlier.resolve() for earlier in paths[:position]]:
             raise TelemetryError(f"{path}: is named twice; each segment counts once")
-    records = [segment for path in paths for segment in load_segments(path, spec, masking=masking)]
+    records = load_segments(paths, spec, masking=masking)
     for record in records:
         if (record.epoch_ns is None) != (records[0].epoch_ns is None):
             raise TelemetryError(f"{record.name}: {_form(record)}, {records[0].name} {_form(records[0])}; use one form")

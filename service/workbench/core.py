@@ -141,12 +141,12 @@ class CoreWorkbench:
     def score(self, document: str, telemetry: Telemetry) -> float | None:
         """Roll a model out over some telemetry."""
         from twin_core.holdout import split_burn_in
-        from twin_core.quality.gaps import segmented
+        from twin_core.network.screened import segments
         from twin_core.telemetry import LEAST_PART
 
         model = _cached_model(document)
         record, _ = _screened(model.spec, telemetry)
-        parts = segmented([record], model.spec.driving_channels, model.spec.held_inputs)
+        parts = segments(model.spec, [record])
         return _rmse_K(model, [split_burn_in(part, None) for part in parts if part.time_s.size >= LEAST_PART])
 
     def screen(self, units: Mapping[str, str | None], inputs: Collection[str], telemetry: Telemetry) -> Masks:
@@ -171,7 +171,7 @@ class CoreWorkbench:
             step_s=task.step_s,
             plan=None if task.plan is None else _record(spec, task.plan),
             inputs=task.inputs,
-            past=None if task.past is None else _record(spec, task.past),
+            past=None if task.past is None else _screened(spec, task.past)[0],
             quantiles=task.quantiles,
             state=task.state,
         )
@@ -263,7 +263,7 @@ def _screened(spec: Any, telemetry: Telemetry) -> tuple[Any, Telemetry]:
 def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:
     """Return the recent data as hold-outs, the first of which may follow on the training data; none if there is too little."""
     from twin_core.holdout import HeldOut, split_burn_in
-    from twin_core.quality.gaps import segmented
+    from twin_core.network.screened import segments
     from twin_core.telemetry import LEAST_PART
 
     if recent.time_us.size < 3:
@@ -272,7 +272,7 @@ def _held_out(spec: Any, train: Telemetry, recent: Telemetry) -> list[Any]:
     values = {name: np.concatenate([last.values[name], column]) for name, column in recent.values.items()}
     joined = Telemetry(recent.epoch_us, np.concatenate([last.time_us, recent.time_us]), values)
     lead = _record(spec, train)
-    parts = segmented([_record(spec, joined)], spec.driving_channels, spec.held_inputs)
+    parts = segments(spec, [_record(spec, joined)])
     follows = [part.time_s[0] == lead.time_s[-1] for part in parts]
     long = [part.time_s.size >= LEAST_PART for part in parts]
     held = zip(parts, follows, long, strict=True)

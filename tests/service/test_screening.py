@@ -1,5 +1,6 @@
 """Samples that are no readings: stored as they came, masked for the filter, told with the residuals."""
 
+import json
 import time
 from collections.abc import Collection, Mapping
 
@@ -7,10 +8,12 @@ import numpy as np
 import pytest
 
 from service.workbench.core import CoreWorkbench
-from service.workbench.interface import Masks, Telemetry
+from service.workbench.interface import ForecastTask, Masks, Telemetry
+from tests.helpers import conductive_spec, model_of
 from tests.service.conftest import SPEC
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
+from twin_core.network.spec_io import load_spec
 
 TWIN = "/v1/twins/benchsat"
 
@@ -109,3 +112,29 @@ def test_what_no_instrument_reads_and_nobody_writes_for_missing_is_refused(clien
     body = {"time": [0.0], "values": {"T_tank": [-998.0]}}
     answer = client.post(f"{TWIN}/telemetry", json=body)
     assert answer.status_code == 422 and "no instrument reads -998" in answer.text
+
+
+@pytest.mark.parametrize("at", [200, 399])
+def test_a_marker_in_the_past_of_an_input_says_nothing_of_its_future(at: int) -> None:
+    """One -999 degC of the boundary, the newest sample, once widened the band of the forecast to 80 K."""
+    spec = load_spec(
+        conductive_spec(
+            1,
+            [],
+            channels={"T_out": {"kind": "temperature", "unit": "degC"}},
+            boundaries={"outdoors": {"channel": "T_out"}},
+            conductors=[{"between": ["n0", "outdoors"], "conductance_W_per_K": {"guess": 1.0}}],
+        )
+    )
+    document = json.dumps(model_of(spec, {}).to_json())
+    outdoors = 5.0 + np.sin(np.arange(400) / 30.0) + np.random.default_rng(1).normal(0.0, 0.05, 400)
+    time_us = 60_000_000 * np.arange(400)
+    now = Telemetry(0, time_us[-1:], {"T0": np.array([290.0]), "T_out": outdoors[-2:-1]})
+    made = []
+    for value in (-999.0, np.nan):
+        past = outdoors.copy()
+        past[at] = value
+        task = ForecastTask(now, None, 3600.0, 600.0, None, (0.05, 0.95), past=Telemetry(0, time_us, {"T_out": past}))
+        made.append(CoreWorkbench().forecast(document, task))
+    for q in (0.05, 0.95):
+        np.testing.assert_array_equal(made[0].quantiles[q]["T0"], made[1].quantiles[q]["T0"])

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
+from twin_core.network.screened import segments
 from twin_core.network.spec import TwinSpec
-from twin_core.quality.gaps import segmented
 from twin_core.telemetry import Record
 
 METHODS = ("second-order", "neural-ode")
@@ -66,7 +66,7 @@ def calibrate(
         raise ModelError(f"unknown loss '{loss}' (known: {', '.join(LOSSES)})")
     if training and method != "neural-ode":
         raise ModelError(f"{next(iter(training))} belongs to method 'neural-ode'")
-    records = segmented(records, spec.driving_channels, spec.held_inputs)
+    records = segments(spec, records)
     if method == "neural-ode":
         model = _by_neural_ode(spec, records, loss, dict(training or {}), progress)
     else:

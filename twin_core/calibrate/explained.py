@@ -7,6 +7,7 @@ import numpy as np
 
 from twin_core._typing import Progress
 from twin_core.calibrate.containment import NO_DEADLINE
+from twin_core.calibrate.identifiability import nothing_moves
 from twin_core.calibrate.noise import sensor_noise_K
 from twin_core.calibrate.problem import build_problem
 from twin_core.calibrate.result import CalibratedModel
@@ -16,7 +17,7 @@ from twin_core.calibrate.summary import stated_guesses, to_model
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.errors import NoSolutionError
 from twin_core.network.model import build_network
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
@@ -46,11 +47,13 @@ def calibrate_and_explain(
 
 
 def explained(model: CalibratedModel, calibration: Calibration, *, deadline: float = NO_DEADLINE) -> CalibratedModel:
-    """Return a model with words on what an odd fit usually means; itself where nothing is odd."""
+    """Return a model with words on what an odd fit usually means; itself where nothing is odd, or no sensor ever changes."""
     problem, parameters = calibration.problem, calibration.network.parameters
     guesses = stated_guesses(problem.network)
     misfit = float(np.sqrt(np.nanmean(np.concatenate(calibration.residuals) ** 2 / problem.noise_K**2)))
-    if not is_odd(parameters, guesses, misfit):
+    if nothing_moves(problem.network.spec, [s.record for s in problem.segments]) or not is_odd(
+        parameters, guesses, misfit
+    ):
         return model
     looked = suspicions(declared_of(problem), parameters.as_dict(), deadline=deadline)
     told = model.summary["words"]
@@ -63,7 +66,7 @@ def explained(model: CalibratedModel, calibration: Calibration, *, deadline: flo
 
 def _advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: float) -> str:
     """Return the error with the mistakes that would have a solution."""
-    seen = [screened(spec, record) for record in records]
+    seen = all_screened(spec, records)
     network = build_network(spec, table_knots=table_levels(spec, seen))
     problem = build_problem(network, seen, sensor_noise_K(spec, seen))
     looked = suspicions(declared_of(problem), deadline=deadline)

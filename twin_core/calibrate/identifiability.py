@@ -268,14 +268,25 @@ def blurred_levels(network: Network, records: Sequence[Record]) -> list[str]:
 def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
     """Return a statement for every sensor and input that never changes."""
     said = []
-    for name in (*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)):
+    for name in resting([*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)], records):
+        stuck = (
+            "; if the sensor is stuck, take it out: what is found around it is wrong" if name in spec.sensors else ""
+        )
+        said.append(f"channel '{name}' never changes: what rests tells nothing of capacities{stuck}")
+    return said
+
+
+def resting(names: Iterable[str], records: Sequence[Record]) -> list[str]:
+    """Return the channels that have samples and never change."""
+    found = []
+    for name in names:
         parts = [r.values[name][np.isfinite(r.values[name])] for r in records if name in r.values]
         samples = np.concatenate(parts) if parts else np.zeros(0)
         if samples.size and np.ptp(samples) == 0.0:
-            stuck = (
-                "; if the sensor is stuck, take it out: what is found around it is wrong"
-                if name in spec.sensors
-                else ""
-            )
-            said.append(f"channel '{name}' never changes: what rests tells nothing of capacities{stuck}")
-    return said
+            found.append(name)
+    return found
+
+
+def nothing_moves(spec: TwinSpec, records: Sequence[Record]) -> bool:
+    """Return whether no sensor ever changes: all are stuck or at rest, and no fit to them means anything."""
+    return len(resting(spec.sensors, records)) == len(spec.sensors)

@@ -14,6 +14,9 @@ from twin_core.telemetry import Record
 FALLBACK_STD_K, LEAST_STD_K = 0.1, 1e-4
 """Noise assumed where a sensor has too few samples to tell, and the smallest that one is believed to have."""
 
+ROUNDING_K = 1e-9
+"""What the arithmetic of readings leaves of differences between equal codes: no noise."""
+
 DYNAMICS = 1.5
 """Ratio of the noise that readings tell to that of what a model leaves of them, beyond which the former holds more than noise.
 On ten splits of rigs, houses and spacecraft the latter is 0.87 to 1.28 of the former, quantisation aside; on none of 50 seeded
@@ -49,7 +52,8 @@ def difference_noise_K(time_s: FloatArray, column: FloatArray, quantum_K: float 
         return float("nan")
     if quantum_K > 0.0:
         return _winsorised_std(seen)
-    return float(np.median(np.abs(seen - np.median(seen)))) / 0.6745
+    std = float(np.median(np.abs(seen - np.median(seen)))) / 0.6745
+    return std if std > ROUNDING_K else 0.0
 
 
 def _winsorised_std(values: FloatArray) -> float:

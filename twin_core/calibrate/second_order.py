@@ -21,7 +21,7 @@ from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.effects.base import Effect
 from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
 from twin_core.side_by_side import both
 from twin_core.simulate.rollout import rollout
@@ -107,7 +107,7 @@ def prepare(
     TelemetryError
         If telemetry lacks a channel that the model needs, or has too few samples.
     """
-    records = [screened(spec, record) for record in records]
+    records = all_screened(spec, records)
     noise = sensor_noise_K(spec, list(records))
     network = build_network(spec, effects, table_knots=table_levels(spec, records))
     step = 1.5 * sampling_step_s(records)

@@ -1,6 +1,6 @@
 """What cannot be, or hardly, in telemetry and declaration together: units, signs, nodes that nothing reaches."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,17 +18,17 @@ TOO_MUCH = 100.0
 a guessed capacity that is wrong by ten is not."""
 
 
-def doubts(spec: TwinSpec, record: Record) -> tuple[str, ...]:
+def doubts(spec: TwinSpec, records: Sequence[Record]) -> tuple[str, ...]:
     """Return a sentence for everything that is most likely a mistake in the declaration of a channel or a node.
 
     Parameters
     ----------
     spec
         The declared network.
-    record
-        Telemetry in SI, without samples that are no readings.
+    records
+        Segments of telemetry in SI, without samples that are no readings; judged together.
     """
-    return (*_temperatures(spec, record), *_powers(spec, record), *isolated(spec))
+    return (*_temperatures(spec, records), *_powers(spec, records), *isolated(spec))
 
 
 def isolated(spec: TwinSpec) -> tuple[str, ...]:
@@ -43,8 +43,8 @@ def isolated(spec: TwinSpec) -> tuple[str, ...]:
     )
 
 
-def _temperatures(spec: TwinSpec, record: Record) -> Iterator[str]:
-    for name, column in _present(spec, record, "temperature"):
+def _temperatures(spec: TwinSpec, records: Sequence[Record]) -> Iterator[str]:
+    for name, column in _present(spec, records, "temperature"):
         unit, median_K = spec.channels[name].unit, float(np.median(column))
         own = median_K - ZERO_CELSIUS_K if unit == "degC" else median_K
         if unit == "K" and median_K < LIKELY_K[0] and LIKELY_K[0] < median_K + ZERO_CELSIUS_K < LIKELY_K[1]:
@@ -53,24 +53,24 @@ def _temperatures(spec: TwinSpec, record: Record) -> Iterator[str]:
             unit == "degC"
             and median_K > LIKELY_K[1]
             and LIKELY_K[0] < own < LIKELY_K[1]
-            and _others_lower(spec, record, name)
+            and _others_lower(spec, records, name)
         ):
             yield f"channel '{name}' is declared in degC and reads {own:.4g} in the median: if that is K, declare it so"
 
 
-def _others_lower(spec: TwinSpec, record: Record, name: str) -> bool:
+def _others_lower(spec: TwinSpec, records: Sequence[Record], name: str) -> bool:
     """Return whether no other temperature in degC is as high but those that look like K too, or all do."""
-    medians = [float(np.median(c)) for n, c in _present(spec, record, "temperature") if n != name]
+    medians = [float(np.median(c)) for n, c in _present(spec, records, "temperature") if n != name]
     return all(median < LIKELY_K[1] or median - ZERO_CELSIUS_K > LIKELY_K[0] for median in medians)
 
 
-def _powers(spec: TwinSpec, record: Record) -> Iterator[str]:
-    for name, column in _present(spec, record, "power"):
+def _powers(spec: TwinSpec, records: Sequence[Record]) -> Iterator[str]:
+    for name, column in _present(spec, records, "power"):
         unit = spec.channels[name].unit
         if column.max() <= 0.0 and column.min() < 0.0:
             span = f"{column.min():.4g} to {column.max() + 0.0:.4g} {unit}"
             yield f"channel '{name}' is a power that is never positive ({span}): check its sign"
-        ratio = _too_fast(spec, record, name) if unit == "W" else 0.0
+        ratio = _too_fast(spec, records, name) if unit == "W" else 0.0
         if ratio > TOO_MUCH:
             yield (
                 f"channel '{name}' would move its node {ratio:.0f} times as fast as it ever moves: if it reads mW, convert it"
@@ -78,30 +78,40 @@ def _powers(spec: TwinSpec, record: Record) -> Iterator[str]:
             )
 
 
-def _too_fast(spec: TwinSpec, record: Record, channel: str) -> float:
+def _too_fast(spec: TwinSpec, records: Sequence[Record], channel: str) -> float:
     """Return how many times a channel's largest step of heat exceeds what moves its nodes; 0 where nothing tells."""
-    column = record.values[channel]
+    intervals_s = np.concatenate([np.diff(record.time_s) for record in records])
     ratios = [0.0]
     for load in spec.loads:
         node = next(node for node in spec.nodes if node.id == load.node)
         capacity = guess_or(node.capacity_J_per_K, 0.0)
         if load.channel != channel or load.gain or load.table or load.factor or capacity == 0.0:
             continue
-        heat_W = load.weight * _largest_step(column)
-        seen_K = max((_largest_step(record.values[s]) for s in node.sensors if s in record.values), default=0.0)
-        if seen_K > 0.0 and record.time_s.size > 1:
-            ratios.append(heat_W * float(np.median(np.diff(record.time_s))) / capacity / seen_K)
+        heat_W = load.weight * _largest_step(records, channel)
+        seen_K = max((_largest_step(records, s) for s in node.sensors), default=0.0)
+        if seen_K > 0.0 and intervals_s.size:
+            ratios.append(heat_W * float(np.median(intervals_s)) / capacity / seen_K)
     return max(ratios)
 
 
-def _largest_step(column: FloatArray) -> float:
-    present = column[np.isfinite(column)]
-    return float(np.abs(np.diff(present)).max()) if present.size > 1 else 0.0
+def _largest_step(records: Sequence[Record], channel: str) -> float:
+    """Return the largest change of a channel from one sample to the next within a segment; 0 where it has none."""
+    steps = [np.abs(np.diff(column)) for column in _samples(records, channel)]
+    return float(max((step.max() for step in steps if step.size), default=0.0))
 
 
-def _present(spec: TwinSpec, record: Record, kind: str) -> Iterator[tuple[str, FloatArray]]:
+def _samples(records: Sequence[Record], channel: str) -> Iterator[FloatArray]:
+    """Yield the samples of a channel in each segment that has it, without the missing ones."""
+    for record in records:
+        if channel in record.values:
+            yield record.values[channel][np.isfinite(record.values[channel])]
+
+
+def _present(spec: TwinSpec, records: Sequence[Record], kind: str) -> Iterator[tuple[str, FloatArray]]:
     """Yield the used channels of one kind that have samples, without the missing ones."""
     for name in spec.used_channels:
-        column = record.values.get(name)
-        if column is not None and spec.channels[name].kind == kind and np.isfinite(column).any():
-            yield name, column[np.isfinite(column)]
+        if spec.channels[name].kind != kind:
+            continue
+        column = np.concatenate([np.empty(0), *_samples(records, name)])
+        if column.size:
+            yield name, column

@@ -9,6 +9,7 @@ from twin_core._typing import BoolArray
 from twin_core.network.doubts import doubts
 from twin_core.network.spec import Interval, TwinSpec
 from twin_core.quality import masked
+from twin_core.quality.gaps import segmented
 from twin_core.telemetry import Record
 
 
@@ -24,15 +25,31 @@ def excluded(record: Record, intervals: Sequence[Interval]) -> BoolArray:
 
 
 def screened(spec: TwinSpec, record: Record) -> Record:
-    """Return a record with what cannot be readings missing, and notices that say so, and what in it is most likely a mistake.
+    """Return one record as :func:`all_screened` does."""
+    (clean,) = all_screened(spec, [record])
+    return clean
 
-    Excluded readings stay as they are; inputs are looked at there too, for they drive what comes after.
 
-    Channels of the orbit are computed and need no screening; a record that was looked at before is returned as it is.
+def all_screened(spec: TwinSpec, records: Sequence[Record]) -> list[Record]:
+    """Return records with what cannot be readings missing, and notices that say so.
+
+    What in all of them together is most likely a mistake is told by the first. Excluded readings stay as they are; inputs are
+    looked at there too, for they drive what comes after. Channels of the orbit are computed and need no screening; records
+    that were looked at before are returned as they are.
     """
-    if record.flaws is not None:
-        return record
     units = {name: channel.unit for name, channel in spec.channels.items()}
-    ignored = dict.fromkeys(spec.sensors, excluded(record, spec.exclude))
-    clean = masked(record, units, ignored, spec.driving_channels)
-    return replace(clean, notices=tuple(dict.fromkeys([*clean.notices, *doubts(spec, clean)])))
+    clean = [
+        masked(record, units, dict.fromkeys(spec.sensors, excluded(record, spec.exclude)), spec.driving_channels)
+        for record in records
+    ]
+    fresh = [k for k, record in enumerate(records) if record.flaws is None]
+    if fresh:
+        first = clean[fresh[0]]
+        told = dict.fromkeys([*first.notices, *doubts(spec, [clean[k] for k in fresh])])
+        clean[fresh[0]] = replace(first, notices=tuple(told))
+    return clean
+
+
+def segments(spec: TwinSpec, records: Sequence[Record]) -> list[Record]:
+    """Return records cut at every gap, and without every lapse of an input, that no fit or prediction is to step through."""
+    return segmented(records, spec.driving_channels, spec.held_inputs, spec.balance_channels)

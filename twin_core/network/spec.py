@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, StrictBool, field_validator, model_v
 from pydantic_core import PydanticCustomError
 
 from twin_core.errors import TelemetryError
-from twin_core.network.formula import parse
+from twin_core.network.formula import channels_of, parse
 from twin_core.network.orbit_block import OrbitBlock
 from twin_core.network.quantities import (
     TWIN_ID,
@@ -436,6 +436,14 @@ class TwinSpec(Strict):
     def driving_channels(self) -> frozenset[str]:
         """The used channels that no sensor reads: inputs and boundary temperatures."""
         return frozenset(self.used_channels) - frozenset(self.sensors)
+
+    @property
+    def balance_channels(self) -> frozenset[str]:
+        """The driving channels that the declared balance reads; of the others each may explain heat that it lacks."""
+        read = {name for load in self.loads for name in (load.channel, load.factor) if name is not None}
+        read |= {b.channel for b in self.boundaries.values() if b.channel is not None}
+        read |= {name for derived in self.derived.values() for name in channels_of(derived.formula)}
+        return self.driving_channels & (read | set(self.attitude_channels))
 
     @property
     def held_inputs(self) -> frozenset[str]:

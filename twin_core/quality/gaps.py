@@ -1,12 +1,17 @@
-"""Gaps in which an input went its own way: what was held across one is not what the spacecraft was given."""
+"""Gaps in which an input went its own way: what was held across one is not what the spacecraft was given.
 
-from collections.abc import Collection, Sequence
+Whole rows may be missing, or the samples of one channel while the rows go on: a lapse. A channel may have a clock of its own, or
+report a change only: a lapse is long beside what most of the record's time is sampled with, lapses as long as it included.
+"""
+
+from collections.abc import Collection, Iterator, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import BoolArray, FloatArray
+from twin_core.quality.runs import runs_of
 from twin_core.telemetry import LEAST_PART, Record, cut_at_gaps
 
 SHORTEST_GAP = 10.0
@@ -40,17 +45,127 @@ def cut_where_inputs_are_unknown(records: Sequence[Record], inputs: Collection[s
     return [part for record in records for part in _cut(record, sorted(inputs & record.values.keys()))]
 
 
-def segmented(records: Sequence[Record], driving: AbstractSet[str], held: Collection[str]) -> list[Record]:
+def without_lapses(records: Sequence[Record], driving: AbstractSet[str], needed: Collection[str]) -> list[Record]:
+    """Return records without the rows in which an input has no samples and does not stay what it was.
+
+    Parameters
+    ----------
+    records
+        Segments of telemetry.
+    driving
+        Channels that drive the model, or might. A lapse of any of them is told in the notices of its record's first part.
+    needed
+        Those without which nothing can be predicted.
+
+    Returns
+    -------
+    list of Record
+        What follows a lapse has temperatures of its own to begin with. Parts of fewer than ``LEAST_PART`` samples are left out
+        with it; where no other would stay, the lapses are bridged and told.
+    """
+    return [part for record in records for part in _spoken(record, driving, frozenset(needed))]
+
+
+def segmented(
+    records: Sequence[Record], driving: AbstractSet[str], held: Collection[str], needed: Collection[str]
+) -> list[Record]:
     """Return records cut at every gap that no fit or prediction is to step through: :func:`cut_at_gaps`, and the above.
 
     Parameters
     ----------
     records
         Segments of telemetry.
-    driving, held
-        Channels that drive the model, and those of them that hold from sample to sample.
+    driving, held, needed
+        Channels that drive the model or might, those of them that hold from sample to sample, and those that it needs.
     """
-    return cut_where_inputs_are_unknown(cut_at_gaps(records, driving), held)
+    return cut_where_inputs_are_unknown(without_lapses(cut_at_gaps(records, driving), driving, needed), held)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lapse:
+    """A time in which one channel has no samples.
+
+    Attributes
+    ----------
+    channel
+        Its name.
+    begin_s, end_s
+        Its last sample before and its first one after, or the ends of the record.
+    silent : (n_times,)
+        The rows in which another sample was due.
+    known
+        Whether it changes more slowly than that.
+    """
+
+    channel: str
+    begin_s: float
+    end_s: float
+    silent: BoolArray
+    known: bool
+
+
+def _spoken(record: Record, driving: AbstractSet[str], needed: AbstractSet[str]) -> list[Record]:
+    """Return the parts of a record in which all needed channels are known; the first one tells of all lapses."""
+    lapses = [lapse for name in sorted(driving & record.values.keys()) for lapse in _lapses(record, name)]
+    if not lapses:
+        return [record]
+    unknown = [lapse for lapse in lapses if lapse.channel in needed and not lapse.known]
+    silent = np.zeros(record.time_s.size, dtype=np.bool_)
+    for lapse in unknown:
+        silent |= lapse.silent
+    first, stop = runs_of(~silent)
+    long = stop - first >= LEAST_PART
+    cut = unknown if long.any() else []
+    notices = (*record.notices, *_lapse_notices(record, lapses, cut))
+    if not cut:
+        return [replace(record, notices=notices)]
+    bounds = np.unique([0, *first[long], *stop[long]])
+    starts = bounds[bounds < record.time_s.size].tolist()
+    parts = zip(starts, record.parts_from(starts, driving), strict=True)
+    kept = [part for start, part in parts if start in first[long]]
+    return [replace(part, notices=() if k else notices) for k, part in enumerate(kept)]
+
+
+def _lapses(record: Record, channel: str) -> Iterator[_Lapse]:
+    """Yield the lapses of a channel: more than ``SHORTEST_GAP`` times as long as the intervals that fill most other time."""
+    time_s, column = record.time_s, record.values[channel]
+    at = np.flatnonzero(np.isfinite(column))
+    if at.size < 2:
+        return
+    bounds_s = np.concatenate([time_s[:1], time_s[at], time_s[-1:]])
+    intervals_s = np.diff(bounds_s)
+    ordered_s = np.sort(intervals_s)
+    filled_s = np.concatenate([[0.0], np.cumsum(ordered_s)])
+    denser_s = filled_s[np.searchsorted(ordered_s, intervals_s / SHORTEST_GAP)]
+    usual_s = float(np.median(np.diff(time_s[at])))
+    found = []
+    for k in np.flatnonzero(denser_s > 0.5 * (filled_s[-1] - intervals_s)).tolist():
+        begin_s, end_s = bounds_s[k : k + 2].tolist()
+        due = time_s > begin_s + 1.01 * usual_s if k else time_s < end_s
+        silent = due & ((time_s < end_s) | (k == at.size))
+        if silent.any():
+            found.append((begin_s, end_s, silent))
+    known_s = usual_s * _known_for(column[at]) if found else 0.0
+    for begin_s, end_s, silent in found:
+        yield _Lapse(channel, begin_s, end_s, silent, end_s - begin_s < known_s)
+
+
+def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Lapse]) -> Iterator[str]:
+    """Yield one sentence for each channel and what is made of its lapses."""
+    told: dict[tuple[str, str], list[_Lapse]] = {}
+    for lapse in lapses:
+        if lapse in cut:
+            fate = "changes faster than that: {} row(s) left out; a new segment begins with its next sample"
+        elif lapse.known:
+            fate = "changes more slowly than that: {} row(s) are given the values beside them"
+        else:
+            fate = "changes faster than that, yet {} row(s) are given the values beside them; add its samples, or leave them out"
+        told.setdefault((lapse.channel, fate), []).append(lapse)
+    for (channel, fate), same in told.items():
+        begin, end = record.present(same[0].begin_s), record.present(same[0].end_s)
+        again = f" (and {len(same) - 1} more such time(s))" if len(same) > 1 else ""
+        rows = int(sum(lapse.silent.sum() for lapse in same))
+        yield f"{record.name}: channel '{channel}' has no samples from {begin} to {end}{again}, and {fate.format(rows)}"
 
 
 def _cut(record: Record, inputs: Sequence[str]) -> list[Record]:

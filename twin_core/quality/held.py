@@ -36,7 +36,8 @@ def held_repeats(column: FloatArray) -> BoolArray:
     if changes.size < LEAST_READINGS:
         return found
     lasting = np.diff(changes)
-    finest = np.quantile(np.diff(np.unique(values)), SMALLEST)
+    halves = np.array_split(values[changes], 2 if SMALLEST * changes.size > 2.0 else 1)
+    finest = max(_finest(half) for half in halves)
     typical = np.median(np.abs(np.diff(values))[changes - 1])
     if np.median(lasting) < 2.0 or typical < FINE * finest:
         return found
@@ -46,3 +47,8 @@ def held_repeats(column: FloatArray) -> BoolArray:
     longest = np.median(lasting) * np.log2(changes.size)
     found[at] = since % int(np.ceil(longest)) != 0
     return found
+
+
+def _finest(readings: FloatArray) -> float:
+    """Return the smallest distance between two readings: an offset that sets in once shows in one half of a record only."""
+    return float(np.quantile(np.diff(np.unique(readings)), SMALLEST))

@@ -41,7 +41,8 @@ def sentinels(time_s: FloatArray, values: FloatArray, unit: str | None) -> BoolA
     """Return which samples are markers of missing ones, (n_times,).
 
     Temperatures that cannot be always are; any other marker only where the readings leap to it and back by more than they
-    ever do elsewhere.
+    ever do elsewhere. A number outside the range of all other readings that does so once is a marker wherever it stands: beside
+    a heater that is off, -999 W lies nearer than the heater that is on.
 
     Parameters
     ----------
@@ -68,4 +69,6 @@ def sentinels(time_s: FloatArray, values: FloatArray, unit: str | None) -> BoolA
         inside = values[run[0]], values[run[-1]]
         if all(min(abs(value - values[side]) for value in inside) > bound for side in sides):
             found[run] = True
-    return found
+    proven = np.unique(values[found & doubtful])
+    beyond = proven[(proven < values[others].min()) | (proven > values[others].max())]
+    return found | (doubtful & np.isin(values, beyond))

@@ -9,7 +9,7 @@ import numpy as np
 from twin_core._typing import Json
 from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.criteria import acceptance, with_met
-from twin_core.calibrate.identifiability import strong_correlations
+from twin_core.calibrate.identifiability import resting, strong_correlations
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.statistics import residual_whiteness, score
@@ -276,6 +276,7 @@ def build_report(
         "before": scores[0],
         "findings": findings_json(search.findings, after, failures),
         "after": scores[1],
+        "resting_sensors": resting(before.spec.sensors, train),
         "noise_floor_K": noise_floor_K(before),
         **_of_holdout((before, after), scores, predictions),
         "training": {"before_rmse_K": before.summary["rmse_K"], "after_rmse_K": after.summary["rmse_K"]},
@@ -296,7 +297,7 @@ def build_report(
             *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),
-            *before.summary["notices"],
+            *dict.fromkeys([*before.summary["notices"], *(notice for h in held for notice in h.scored.notices)]),
             *(notice for p in predictions[1] for notice in p.notices),
         ],
     }

@@ -4,6 +4,7 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.containment import NO_DEADLINE
+from twin_core.calibrate.identifiability import nothing_moves
 from twin_core.calibrate.summary import stated_guesses
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.discover.judge import Search
@@ -25,9 +26,10 @@ def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE
     parameters, guesses = calibration.network.parameters, stated_guesses(search.base.calibration().problem.network)
     squares = np.concatenate(calibration.residuals) ** 2 / calibration.problem.noise_K**2
     misfit = float(np.sqrt(np.nanmean(squares)))
-    if not is_odd(parameters, guesses, misfit):
-        return {"suspicions": []}
     base = search.base.calibration()
+    still = nothing_moves(base.network.spec, [s.record for s in base.problem.segments])
+    if still or not is_odd(parameters, guesses, misfit):
+        return {"suspicions": []}
     looked = suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline)
     better = [s for s in looked.found if s.misfit < misfit or not search.findings]
     complete = looked.complete and not search.findings

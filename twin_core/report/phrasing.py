@@ -33,6 +33,10 @@ def headline(report: Mapping[str, Any]) -> str:
     verdict = report.get("verdict")
     if verdict == "correlated":
         return _correlated(report.get("phases") or [])
+    resting = report.get("resting_sensors") or []
+    if resting and len(resting) == len((report.get("before") or {}).get("per_sensor") or {}):
+        named = f"{', '.join(resting[:3])}{', ...' if len(resting) > 3 else ''}"
+        return f"No sensor ever changes ({named}): stuck or at rest, they tell nothing of the model; check them first."
     if verdict == "effect_added" and findings:
         more = len(findings) - 1
         others = f"; {more} more effect{'s were' if more > 1 else ' was'} found" if more else ""

@@ -63,3 +63,6 @@ def test_what_is_wrong_is_told_in_one_line(
     files["balance.csv"].write_text("T_a,T_b,T_plate,Q\n1,2,3,4\n")
     assert main([*given, "--steady", str(files["balance.csv"])]) == 2
     assert "has no column 'phase'" in capsys.readouterr().err
+    files["balance.csv"].write_text("phase,T_a,T_b,T_plate,Q\nhot,20,20,20,1\ncold,-999,20,20,1\n")
+    assert main([*given, "--steady", str(files["balance.csv"])]) == 2
+    assert "balance.csv: row 3: column 'T_a' holds -999" in capsys.readouterr().err

@@ -115,6 +115,26 @@ def test_a_sensor_that_hardly_moves_shows_its_resolution_at_most() -> None:
     assert readings(np.full(50, 290.0)) == FALLBACK_STD_K
 
 
+def test_of_a_short_quantised_record_the_step_tells_and_no_rounding() -> None:
+    """Seven steps of 0.32 K among thirteen repeats: the median of their differences was 3e-14 K, taken for noise."""
+    rises = [0.0] * 9 + [0.32, 0.0, 0.0, 0.32, 0.32, 0.0, 0.0, 0.32, 0.0, 0.33, 0.32, 0.0]
+    column = np.round(20.9 + np.cumsum(rises), 2) + 273.15
+    assert quantum(column) == pytest.approx(0.32, rel=0.01)
+    assert readings(column) == pytest.approx(0.32 / np.sqrt(12.0), rel=0.3)
+
+
+def test_what_a_model_leaves_of_resting_codes_is_no_noise() -> None:
+    """A sensor that counts in 0.32 K and rests is not read to the microkelvins by which a model misses it."""
+    column = np.where(np.arange(21) < 15, 293.15, 293.47)
+    spec = load_spec(
+        {"twin": "t", "channels": {"A": {"kind": "temperature", "unit": "K"}}, "nodes": [{"id": "n", "sensor": "A"}]}
+    )
+    record = record_of(np.arange(21.0), A=column)
+    residual_K = 1e-6 * np.sin(np.arange(21.0))[:, None]
+    found = noise_beside_K(spec, [record], sensor_noise_K(spec, [record]), [residual_K])
+    np.testing.assert_allclose(found, 0.32 / np.sqrt(12.0))
+
+
 @pytest.mark.parametrize(
     ("period", "declared", "told_K"),
     [(9.0, None, 0.1), (400.0, None, None), (9.0, 0.5, None)],

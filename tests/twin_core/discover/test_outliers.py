@@ -25,3 +25,12 @@ def test_a_hold_out_without_readings_is_refused() -> None:
     values = {n: np.where(late, np.nan, c) if n in case.spec.sensors else c for n, c in case.record.values.items()}
     with pytest.raises(TelemetryError, match="no usable sample of T0"):
         close_loop(case.spec, [Record(case.record.time_s, values)])
+
+
+def test_a_hold_out_that_was_masked_says_why() -> None:
+    case = network_case(None, 11, n_orbits=4, dt_s=180.0)
+    last = int(np.searchsorted(case.record.time_s, 0.65 * case.record.time_s[-1]))
+    late = np.arange(case.record.time_s.size) > last
+    values = {n: np.where(late, c[last], c) if n in case.spec.sensors else c for n, c in case.record.values.items()}
+    with pytest.raises(TelemetryError, match="readings there were masked: T0 as frozen"):
+        close_loop(case.spec, [Record(case.record.time_s, values)])

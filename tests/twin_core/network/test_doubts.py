@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twin_core.network.doubts import doubts
-from twin_core.network.screened import screened
+from twin_core.network.screened import all_screened, screened
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
@@ -40,7 +40,7 @@ def telemetry(**scales: float) -> Record:
 
 
 def test_a_sound_declaration_raises_no_doubt() -> None:
-    assert doubts(declared(), telemetry()) == ()
+    assert doubts(declared(), [telemetry()]) == ()
     assert screened(declared(), telemetry()).notices == ()
 
 
@@ -54,15 +54,23 @@ def test_a_sound_declaration_raises_no_doubt() -> None:
     ],
 )
 def test_one_mistake_is_told(record: Record, told: str) -> None:
-    (said,) = doubts(declared(), record)
+    (said,) = doubts(declared(), [record])
     assert told in said
     assert said in screened(declared(), record).notices
+
+
+def test_segments_are_judged_together_and_told_once() -> None:
+    """By night the channel of the Sun shows an offset below zero only: no sign is wrong."""
+    night = telemetry(Q=-0.001)
+    assert all(record.notices == () for record in all_screened(declared(), [night, telemetry()]))
+    told = [record.notices for record in all_screened(declared(), [night, night])]
+    assert ["check its sign" in notice for notice in told[0]] == [True] and told[1] == ()
 
 
 def test_an_isolated_node_is_told() -> None:
     data = declared().model_dump(exclude_none=True)
     data["nodes"] = [*data["nodes"], {"id": "lost", "capacity_J_per_K": {"guess": 5.0}}]
-    (said,) = doubts(load_spec(data), telemetry())
+    (said,) = doubts(load_spec(data), [telemetry()])
     assert said.startswith("node 'lost' has no coupling and no load")
 
 

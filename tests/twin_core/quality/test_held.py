@@ -86,6 +86,15 @@ def test_what_rests_within_a_code_is_not_held(seed: int, step_K: float, noise_K:
         assert not held_repeats(column).any()
 
 
+@pytest.mark.parametrize("begin", [100, 700, 1100, 1400])
+def test_a_coarse_sensor_that_was_moved_once_is_not_held(begin: int) -> None:
+    """An offset that is no multiple of the step interleaves the codes: the distances between them are no step then."""
+    at = np.arange(1500)
+    column = np.round((320.0 + 20.0 * np.sin(at / 100.0) + 2.0 * np.sin(at / 400.0)) / 0.32) * 0.32
+    column[begin:] += 8.05
+    assert not held_repeats(column).any()
+
+
 def test_a_switched_plate_that_rests_between_leaps_is_not_held() -> None:
     """Long rests and fast transients at a fine resolution: readings last unequally long."""
     leaps = np.concatenate(

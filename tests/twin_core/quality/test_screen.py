@@ -119,6 +119,16 @@ def test_numbers_that_mean_missing(channel: str, own: float, at: list[int]) -> N
     np.testing.assert_array_equal(np.flatnonzero(masks[channel]["sentinel"]), at)
 
 
+def test_a_marker_that_is_proven_once_is_one_beside_a_heater_that_is_off_too() -> None:
+    """A heater of 5 kW leaps farther than from 40 W to -999 W: of sixty markers it once hid most."""
+    rng = np.random.default_rng(3)
+    columns = healthy(3)
+    columns["Q"] = np.where(rng.random(120) < 0.5, 5000.0, 40.0).repeat(10) + rng.normal(0.0, 100.0, 1200)
+    at = np.sort(rng.choice(1200, 60, replace=False))
+    columns["Q"][at] = -999.0
+    np.testing.assert_array_equal(np.flatnonzero(found(columns)["Q"]["sentinel"]), at)
+
+
 @pytest.mark.parametrize("power_W", [0.0, 85.0, 127.0, 255.0, 999.0, 4095.0])
 def test_a_heater_may_be_switched_on_once(power_W: float) -> None:
     columns = healthy(4)

@@ -78,6 +78,18 @@ def test_place(where: dict[str, Any], text: str) -> None:
     assert phrasing.place(where) == text
 
 
+def test_the_headline_leads_with_sensors_that_never_change() -> None:
+    report = {
+        "verdict": "no_effect_supported",
+        "findings": [],
+        "resting_sensors": ["T_a"],
+        "before": {"per_sensor": {"T_a": {}}},
+    }
+    assert phrasing.headline(report).startswith("No sensor ever changes (T_a)")
+    report["before"] = {"per_sensor": {"T_a": {}, "T_b": {}}}
+    assert "suffices" in phrasing.headline(report)
+
+
 def test_headline_of_each_verdict() -> None:
     one = {"effect": "input_gain", "where": {"channel": "Q_Box"}}
     added = {"verdict": "effect_added", "findings": [one]}
