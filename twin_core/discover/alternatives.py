@@ -34,6 +34,9 @@ N_COMPARED = 32
 """Other names, no less simple, that are fitted at most, the best ones by linear screening first: parameters make up for another
 law, or for a neighbouring place, by so much more than linear responses tell that right names came as late as thirtieth."""
 
+N_BEFORE = 8
+"""Names that are fitted at most from the simpler model as it was fitted, of each linear screening about it."""
+
 N_VARIED = 6
 """Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
 
@@ -60,12 +63,14 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
     bare = partial(_bare, simple, state.trial.calibration())
     start = state.attempt(bare, "the parameters found, without " + own.label) or simple.calibration()
-    near = partial(_near, simple, start, state.trial.calibration(), own, known)
-    effects = state.attempt(near, f"names that may explain what {own.label} does") or []
+    what = f"names that may explain what {own.label} does"
+    found = state.attempt(partial(_near, simple, start, state.trial.calibration(), own, known), what) or []
+    own_start = state.attempt(partial(_near_before, simple, own, known), what) or []
+    options = [(start, effect) for effect in found] + [(simple.calibration(), effect) for effect in own_start]
     fitted = state.attempt_each(
         [
-            (partial(_explaining, simple, start, effect, state.trial, least), f"{effect.label} instead of {own.label}")
-            for effect in effects
+            (partial(_explaining, simple, begun, effect, state.trial, least), f"{effect.label} instead of {own.label}")
+            for begun, effect in options
         ]
     )
     best: dict[Place, Trial] = {}
@@ -94,6 +99,25 @@ def _near(simple: Trial, start: Calibration, found: Calibration, own: Effect, kn
         if acts_at(simple, (effect,)) == here
     ]
     return each_start([*refined(about, near), *chain.from_iterable(varied)])
+
+
+def _near_before(simple: Trial, own: Effect, known: Collection[Place]) -> list[Effect]:
+    """Return the names that explain about as much linearly as what was found, about the simpler model as it was fitted.
+
+    What was found may have taken parameters to where no other name is near.
+    """
+    calibration = simple.calibration()
+    chosen: list[Effect] = []
+    for about in (simple.fit, about_trajectory(calibration.problem, calibration.optimum)):
+        screening = screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0]
+        probes = best_of_each_place(screening.probes, simple.n_samples)
+        gains = {
+            p.effect.place: p.gain for p in probes if len(p.effect.parameter_specs()) <= len(own.parameter_specs())
+        }
+        least = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
+        others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= least]
+        chosen += refined(about, others[:N_BEFORE])
+    return each_start(chosen)
 
 
 def _bare(simple: Trial, found: Calibration) -> Calibration:

@@ -28,6 +28,7 @@ class Fits:
         self.found = self.with_a(LEFT)
         for name, value in {
             "_bare": lambda simple, found: None,
+            "_near_before": lambda *given: [],
             "_near": lambda *given: [load("b").with_values({"Q_W": heat_W}) for heat_W in self.rough],
             "try_on_trajectories": self.tried,
             "resettled": self.resettled,
