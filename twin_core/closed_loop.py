@@ -8,8 +8,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
-from twin_core.calibrate.compiled import compile_ahead
-from twin_core.calibrate.containment import NO_DEADLINE, attempted
+from twin_core.calibrate.compiled import deadline_after
+from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
@@ -110,10 +110,8 @@ def close_loop(
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
     if deadline_s is not None and not deadline_s > 0.0:
         raise TelemetryError(f"deadline_s: must be a positive number of seconds (got {deadline_s:g})")
-    if deadline_s is not None:
-        compile_ahead()
+    deadline = deadline_after(deadline_s)
     begun = time.perf_counter()
-    deadline = NO_DEADLINE if deadline_s is None else time.monotonic() + deadline_s
     # The search ends at the deadline; what only illustrates its findings has a little longer.
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend

@@ -1,7 +1,5 @@
 """``twin calibrate``: fits the declared network to telemetry."""
 
-import time
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +80,7 @@ def calibrate(
     from replay.cli.recordings import check_suffix, load_records
     from replay.cli.selection import Wanted, selected
     from twin_core.calibrate import calibrate as fit
-    from twin_core.calibrate.compiled import compile_ahead
+    from twin_core.calibrate.compiled import deadline_after
     from twin_core.files import write_text
     from twin_core.network.spec_io import load_spec
 
@@ -91,9 +89,7 @@ def calibrate(
     training = {name: float(value) for name, value in given.items() if value is not None}
     if training and method != "neural-ode":
         raise click.UsageError("--learning-rate, --window, --epochs and --patience belong to --method neural-ode")
-    if deadline is not None:
-        compile_ahead()
-    until = inf if deadline is None else time.monotonic() + deadline
+    until = deadline_after(deadline)
     wanted = Wanted(start, stop, samples, thin)
     spec = load_spec(spec_file)
     records = selected(spec, load_records(telemetry, spec, masking=not no_masking), wanted)

@@ -1,7 +1,5 @@
 """``twin correlate``: one model against several phases of a test, at rest and transient."""
 
-import time
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,7 +73,7 @@ def correlate(
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import load_records
     from replay.cli.signed import document
-    from twin_core.calibrate.compiled import compile_ahead
+    from twin_core.calibrate.compiled import deadline_after
     from twin_core.calibrate.phases import Phase
     from twin_core.calibrate.phases import correlate as run
     from twin_core.files import make_folder, write_text
@@ -87,9 +85,7 @@ def correlate(
         raise click.UsageError("give --steady or --transient files")
     if out.exists() and not out.is_dir():
         raise click.UsageError(f"--out {out} is a file; name a folder")
-    if deadline is not None:
-        compile_ahead()
-    stop = inf if deadline is None else time.monotonic() + deadline
+    stop = deadline_after(deadline)
     spec = load_spec(spec_file)
     flown = load_records(transient, spec, masking=not no_masking)
     phases = [phase for path in steady for phase in balance_phases(path, spec, flown)]

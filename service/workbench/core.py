@@ -1,6 +1,5 @@
 """The workbench of ``twin_core``. Runs in worker processes only: every heavy import is inside a function."""
 
-import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -48,11 +47,9 @@ class CoreWorkbench:
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
         """Fit the declared network."""
         from twin_core.calibrate import calibrate
-        from twin_core.calibrate.compiled import compile_ahead
+        from twin_core.calibrate.compiled import deadline_after
 
-        compile_ahead()
-        deadline = time.monotonic() + task.deadline_s
-
+        deadline = deadline_after(task.deadline_s)
         siblings = {name: _model_of(document) for name, document in task.siblings.items()}
         spec = _with_prior(_spec(task.specification), siblings)
         whole, telemetry = _screened(spec, task.telemetry)

@@ -1,17 +1,26 @@
-"""Compilation of what fits need, before any deadline counts; as a command, once after an installation."""
+"""Deadlines, which begin to count once what fits need is compiled; as a command, compilation after an installation."""
 
+import time
 from contextlib import suppress
 from functools import cache
 
 import numpy as np
 
-from twin_core.calibrate.containment import NUMERICAL_FAILURES
+from twin_core.calibrate.containment import NO_DEADLINE, NUMERICAL_FAILURES
 from twin_core.calibrate.second_order import fit_network
 from twin_core.errors import ModelError
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
 N_SAMPLES = 40
+
+
+def deadline_after(seconds: float | None) -> float:
+    """Return when so many seconds are over, on the clock of ``time.monotonic``, counted from after compilation; None: never."""
+    if seconds is None:
+        return NO_DEADLINE
+    compile_ahead()
+    return time.monotonic() + seconds
 
 
 @cache

@@ -61,16 +61,16 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         return finding
     least = (1.0 - policy.REPEATABLE_SHARE) * explained(simple, state.trial)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
-    bare = partial(_bare, simple, state.trial.calibration())
-    start = state.attempt(bare, "the parameters found, without " + own.label) or simple.calibration()
+    fitted_before, found = simple.calibration(), state.trial.calibration()
+    bare = state.attempt(partial(_bare, simple, found), "the parameters found, without " + own.label) or fitted_before
     what = f"names that may explain what {own.label} does"
-    found = state.attempt(partial(_near, simple, start, state.trial.calibration(), own, known), what) or []
-    own_start = state.attempt(partial(_near_before, simple, own, known), what) or []
-    options = [(start, effect) for effect in found] + [(simple.calibration(), effect) for effect in own_start]
+    near = state.attempt(partial(_near, simple, bare, found, own, known), what) or []
+    before = state.attempt(partial(_near_before, simple, own, known), what) or []
+    options = [*((bare, effect) for effect in near), *((fitted_before, effect) for effect in before)]
     fitted = state.attempt_each(
         [
-            (partial(_explaining, simple, begun, effect, state.trial, least), f"{effect.label} instead of {own.label}")
-            for begun, effect in options
+            (partial(_explaining, simple, start, effect, state.trial, least), f"{effect.label} instead of {own.label}")
+            for start, effect in options
         ]
     )
     best: dict[Place, Trial] = {}

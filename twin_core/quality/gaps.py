@@ -63,7 +63,7 @@ def without_lapses(records: Sequence[Record], driving: AbstractSet[str], needed:
         What follows a lapse has temperatures of its own to begin with. Parts of fewer than ``LEAST_PART`` samples are left out
         with it; where no other would stay, the lapses are bridged and told.
     """
-    return [part for record in records for part in _spoken(record, driving, frozenset(needed))]
+    return [part for record in records for part in _known_parts(record, driving, frozenset(needed))]
 
 
 def segmented(
@@ -91,7 +91,7 @@ class _Lapse:
         Its name.
     begin_s, end_s
         Its last sample before and its first one after, or the ends of the record.
-    silent : (n_times,)
+    lacking : (n_times,)
         The rows in which another sample was due.
     known
         Whether it changes more slowly than that.
@@ -100,20 +100,20 @@ class _Lapse:
     channel: str
     begin_s: float
     end_s: float
-    silent: BoolArray
+    lacking: BoolArray
     known: bool
 
 
-def _spoken(record: Record, driving: AbstractSet[str], needed: AbstractSet[str]) -> list[Record]:
+def _known_parts(record: Record, driving: AbstractSet[str], needed: AbstractSet[str]) -> list[Record]:
     """Return the parts of a record in which all needed channels are known; the first one tells of all lapses."""
     lapses = [lapse for name in sorted(driving & record.values.keys()) for lapse in _lapses(record, name)]
     if not lapses:
         return [record]
     unknown = [lapse for lapse in lapses if lapse.channel in needed and not lapse.known]
-    silent = np.zeros(record.time_s.size, dtype=np.bool_)
+    lacking = np.zeros(record.time_s.size, dtype=np.bool_)
     for lapse in unknown:
-        silent |= lapse.silent
-    first, stop = runs_of(~silent)
+        lacking |= lapse.lacking
+    first, stop = runs_of(~lacking)
     long = stop - first >= LEAST_PART
     cut = unknown if long.any() else []
     notices = (*record.notices, *_lapse_notices(record, lapses, cut))
@@ -142,12 +142,12 @@ def _lapses(record: Record, channel: str) -> Iterator[_Lapse]:
     for k in np.flatnonzero(denser_s > 0.5 * (filled_s[-1] - intervals_s)).tolist():
         begin_s, end_s = bounds_s[k : k + 2].tolist()
         due = time_s > begin_s + 1.01 * usual_s if k else time_s < end_s
-        silent = due & ((time_s < end_s) | (k == at.size))
-        if silent.any():
-            found.append((begin_s, end_s, silent))
+        lacking = due & ((time_s < end_s) | (k == at.size))
+        if lacking.any():
+            found.append((begin_s, end_s, lacking))
     known_s = usual_s * _known_for(column[at]) if found else 0.0
-    for begin_s, end_s, silent in found:
-        yield _Lapse(channel, begin_s, end_s, silent, end_s - begin_s < known_s)
+    for begin_s, end_s, lacking in found:
+        yield _Lapse(channel, begin_s, end_s, lacking, end_s - begin_s < known_s)
 
 
 def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Lapse]) -> Iterator[str]:
@@ -164,7 +164,7 @@ def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Laps
     for (channel, fate), same in told.items():
         begin, end = record.present(same[0].begin_s), record.present(same[0].end_s)
         again = f" (and {len(same) - 1} more such time(s))" if len(same) > 1 else ""
-        rows = int(sum(lapse.silent.sum() for lapse in same))
+        rows = int(sum(lapse.lacking.sum() for lapse in same))
         yield f"{record.name}: channel '{channel}' has no samples from {begin} to {end}{again}, and {fate.format(rows)}"
 
 

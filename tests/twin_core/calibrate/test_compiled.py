@@ -23,13 +23,14 @@ def test_a_deadline_begins_after_compilation(monkeypatch: pytest.MonkeyPatch) ->
         seen.append(deadline)
         raise TwinError("that is all")
 
-    monkeypatch.setattr(closed_loop, "compile_ahead", compiles)
+    monkeypatch.setattr(compiled, "compile_ahead", compiles)
     monkeypatch.setattr(closed_loop, "fit_network", fits)
-    monkeypatch.setattr(closed_loop.time, "monotonic", lambda: now_s[0])
+    monkeypatch.setattr(compiled.time, "monotonic", lambda: now_s[0])
     record = record_of(60.0 * np.arange(50), T0=290.0, T1=280.0)
     with pytest.raises(TwinError, match="that is all"):
         closed_loop.close_loop(load_spec(conductive_spec(2, [(0, 1)])), [record], deadline_s=10.0)
     assert seen == [1510.0]
+    assert compiled.deadline_after(None) == float("inf")
 
 
 def test_a_fit_that_fails_is_no_reason_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:

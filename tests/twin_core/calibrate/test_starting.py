@@ -65,7 +65,8 @@ def test_gaps_are_bridged_and_hidden_states_follow_their_neighbours() -> None:
     np.testing.assert_array_equal(held[:, 1], 277.0)
 
 
-def test_integrated_balances_give_the_order_of_magnitude() -> None:
+def chain_telemetry() -> tuple[Record, dict[str, float]]:
+    """Return ten hours of a heated chain of three nodes with a noise of 0.02 K, and its parameters."""
     capacity, conductance = np.array([4.0e3, 2.0e4, 900.0]), [5.0, 0.4]
     rng = np.random.default_rng(3)
     time_s = 60.0 * np.arange(600)
@@ -73,11 +74,14 @@ def test_integrated_balances_give_the_order_of_magnitude() -> None:
     rates = -laplacian(3, [(0, 1), (1, 2)], conductance) / capacity[:, None]
     states = linear_states(rates, np.outer(heat, [1.0 / capacity[0], 0.0, 0.0]), np.full(3, 290.0), time_s)
     readings = {f"T{i}": states[:, i] + rng.normal(0, 0.02, 600) for i in range(3)}
-    problem = build_problem(
-        build_network(load_spec(chain_network())), [record_of(time_s, Q=heat, **readings)], np.full(3, 0.02)
-    )
-    found = balance_start(problem).as_dict()
     truth = {f"C:n{i}": c for i, c in enumerate(capacity)} | {"G:n0|n1": 5.0, "G:n1|n2": 0.4}
+    return record_of(time_s, Q=heat, **readings), truth
+
+
+def test_integrated_balances_give_the_order_of_magnitude() -> None:
+    record, truth = chain_telemetry()
+    problem = build_problem(build_network(load_spec(chain_network())), [record], np.full(3, 0.02))
+    found = balance_start(problem).as_dict()
     for name, value in truth.items():
         assert abs(np.log(found[name] / value)) < np.log(3.0), name
 
@@ -136,19 +140,12 @@ def test_random_networks_are_found_from_any_subset_of_guesses(seed: int) -> None
 @pytest.mark.parametrize("off", [1e-3, 30.0, 1e3])
 def test_guesses_that_are_wrong_by_far_do_not_hold_the_fit(off: float) -> None:
     """Far from the telemetry the misfit counts as noise, so that the priors of wrong guesses held the search where it began."""
-    capacity, conductance = np.array([4.0e3, 2.0e4, 900.0]), [5.0, 0.4]
-    rng = np.random.default_rng(3)
-    time_s = 60.0 * np.arange(600)
-    heat = np.repeat(rng.choice([0.0, 50.0], 60), 10)
-    rates = -laplacian(3, [(0, 1), (1, 2)], conductance) / capacity[:, None]
-    states = linear_states(rates, np.outer(heat, [1.0 / capacity[0], 0.0, 0.0]), np.full(3, 290.0), time_s)
-    readings = {f"T{i}": states[:, i] + rng.normal(0, 0.02, 600) for i in range(3)}
-    truth = {f"C:n{i}": c for i, c in enumerate(capacity)} | {"G:n0|n1": 5.0, "G:n1|n2": 0.4}
+    record, truth = chain_telemetry()
     data = chain_network()
     for i, row in enumerate([*data["nodes"], *data["conductors"]]):
         quantity = "capacity_J_per_K" if "id" in row else "conductance_W_per_K"
         row[quantity] = {"guess": list(truth.values())[i] * off ** (-1.0) ** i}
-    model = calibrate(load_spec(data), [record_of(time_s, Q=heat, **readings)])
+    model = calibrate(load_spec(data), [record])
     assert model.summary["rmse_K"] < 1.1 * 0.02
     for name, value in truth.items():
         assert abs(np.log(model.values[name] / value)) < 0.1, name

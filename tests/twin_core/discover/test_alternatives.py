@@ -18,18 +18,18 @@ MOST_LEFT = LEFT + REPEATABLE_SHARE * (BEFORE - LEFT)
 
 
 class Fits:
-    """Fits of one effect at node ``b`` from two settings, what they leave, and their nats before and after settling."""
+    """Fits of one effect at node ``b`` from both starts, what they leave, and their nats before and after settling."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], nats: tuple[float, float]) -> None:
-        self.rough, self.fine = dict(zip((1.0, 2.0), left, strict=True)), nats
+        self.rough, self.fine = dict(zip(("bare", "fitted"), left, strict=True)), nats
         self.settled: list[float] = []
         self.simple: Any = stub(left=BEFORE)
-        self.simple.present_effects, self.simple.calibration = (), lambda: None
+        self.simple.present_effects, self.simple.calibration = (), lambda: "fitted"
         self.found = self.with_a(LEFT)
         for name, value in {
-            "_bare": lambda simple, found: None,
-            "_near_before": lambda *given: [],
-            "_near": lambda *given: [load("b").with_values({"Q_W": heat_W}) for heat_W in self.rough],
+            "_bare": lambda simple, found: "bare",
+            "_near": lambda *given: [load("b")],
+            "_near_before": lambda *given: [load("b")],
             "try_on_trajectories": self.tried,
             "resettled": self.resettled,
             "weigh": lambda simple, rich, n_tried: Evidence(rich.nats, 0.0),
@@ -47,8 +47,8 @@ class Fits:
         made.nats = nats
         return made
 
-    def tried(self, simple: Trial, effects: tuple[Effect, ...], start: Any) -> Any:
-        return self.trial(self.rough[effects[-1].values["Q_W"]], self.fine[0])
+    def tried(self, simple: Trial, effects: tuple[Effect, ...], start: str) -> Any:
+        return self.trial(self.rough[start], self.fine[0])
 
     def resettled(self, simple: Trial, rich: Any) -> Any:
         self.settled.append(rich.unexplained())
@@ -86,7 +86,7 @@ def test_an_alternative_is_weighed_with_its_heat_fitted_where_the_first_guess_sp
         ((MOST_LEFT + JUST, BEFORE), []),
         ((BEFORE, MOST_LEFT - JUST), ["b"]),
     ],
-    ids=["enough", "too little", "from another setting"],
+    ids=["enough", "too little", "from the model as it was fitted"],
 )
 def test_an_alternative_explains_all_but_a_tenth(
     monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], told: list[str]

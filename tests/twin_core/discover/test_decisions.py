@@ -438,6 +438,24 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
     assert [f.effects[0].where["node"] for f in state.findings] == [leads]
 
 
+def test_a_look_that_finds_nothing_counts_what_it_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is reconsidered after it paid nothing for the names that it was chosen among."""
+
+    def look(fork: Search, *arguments: object, fallback: bool) -> tuple[bool, list[list[Any]]]:
+        fork.count(7, fallback=fallback)
+        return False, [[]]
+
+    base = stub(left=9.0)
+    base.fit = cast(Any, None)  # type: ignore[misc]
+    base.misfit_share = lambda: 0.0  # type: ignore[method-assign]
+    monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
+    monkeypatch.setattr(searching, "_extend_by_heat", look)
+    monkeypatch.setattr(searching, "_pairs_by_heat", lambda *arguments: False)
+    state = Search(base, base)
+    assert not searching._extend(state, NEEDED, fallback=False)
+    assert state.n_named == 7
+
+
 @pytest.mark.parametrize(
     ("known", "left", "by_heat", "by_trajectory"),
     [([], 0.2, True, True), (["a"], WIDENED + JUST, False, True), (["a"], WIDENED, False, False)],
