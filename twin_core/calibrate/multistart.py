@@ -16,6 +16,7 @@ from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Fit, Problem
 from twin_core.calibrate.starting import balance_starts
+from twin_core.calibrate.suspicions import MANY_NOISES
 from twin_core.errors import NoSolutionError
 from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD
 from twin_core.parameters.transforms import is_logarithmic
@@ -34,10 +35,11 @@ AGREEMENT = 0.01
 """Two starts that end at costs this near to each other, as a share, have found the same optimum."""
 
 N_UNGUIDED = 3
-"""Starts from heat balances alone where every parameter has a guess and the fit from the guesses leaves more than noise."""
+"""Starts from heat balances alone where every parameter has a guess and the fit from the guesses leaves many noises."""
 
 UNGUIDED_NATS = 3.0
-"""By so much it must be likelier than the fit from the guesses: positive evidence (Kass and Raftery 1995)."""
+"""By so much it must be likelier than the fit from the guesses: positive evidence (Kass and Raftery 1995). On 14 splits of
+measured sets none gained more than 0.3, with guesses 30 times off and more one gained at least 143: half and double decide alike."""
 
 SCATTER_LOG_STD = (1.0, 2.0)
 """Further starts: parameters that nobody guessed scattered by factors e and e²."""
@@ -166,7 +168,7 @@ def _unless_likelier_unguided(problem: Problem, guided: Optimum, stands_for: flo
     The misfit counts as noise, so that far from the telemetry the priors of wrong guesses hold the search where it began. A fit
     that nobody guided is followed where the readings, weighed by its misfit, gain more by it than the guesses lose.
     """
-    if mean_square(problem, guided.fit) < EXPLAINED:
+    if mean_square(problem, guided.fit) <= MANY_NOISES**2:
         return guided
     unguided = problem.with_network(problem.network.with_parameters(unguessed(problem.network.parameters)))
     states, best = problem.start()[problem.n_free :], guided
