@@ -39,7 +39,8 @@ N_UNGUIDED = 3
 
 UNGUIDED_NATS = 3.0
 """By so much it must be likelier than the fit from the guesses: positive evidence (Kass and Raftery 1995). On 14 splits of
-measured sets none gained more than 0.3, with guesses 30 times off and more one gained at least 143: half and double decide alike."""
+measured sets none gained more than 0.3; from guesses 30 times off and more one gained at least 143. So half and double decide
+alike."""
 
 SCATTER_LOG_STD = (1.0, 2.0)
 """Further starts: parameters that nobody guessed scattered by factors e and e²."""
