@@ -228,10 +228,14 @@ def mean_excess(trial: Trial) -> float:
 def explained(simple: Trial, rich: Trial, found: Trial | None = None) -> float:
     """Return how much of what a simpler trial leaves a richer one explains, in units of the sensors' noise, mean over sensors.
 
-    Gradients within the nodes explain the same share of both: that of the richer one, or of another trial that was found.
+    Gradients within the nodes explain the same share of both: that of the richer one, or of another trial that was found. They
+    are credited with no more in the simpler one than they explain in the richer one, or any coarse network leaves: where they
+    explain more, they stand in for what the richer one names.
     """
     share = (found or rich).share_of_gradients()
-    return simple.left_beside(share) - rich.left_beside(share)
+    left = rich.left_beside(share)
+    credited = max(policy.MOST_COARSENESS, mean_excess(rich) - left)
+    return max(simple.left_beside(share), mean_excess(simple) - credited) - left
 
 
 def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:

@@ -62,15 +62,30 @@ def test_gradients_explain_what_a_coarse_network_leaves(trial: Fake, share: floa
 @pytest.mark.parametrize(
     ("simple", "rich", "found", "nats"),
     [
-        (Fake(9.0, 1.0), Fake(3.0, 0.5), None, 0.5),
+        (Fake(MOST_COARSENESS, 1.0), Fake(3.0, 0.5), None, 0.5),
         (Fake(9.0, 1.0), Fake(3.0, 0.5, likelier=-1.0), None, 6.0),
         (Fake(9.0, 1.0), Fake(0.0), None, 9.0),
-        (Fake(9.0, 1.0, likelier=-1.0), Fake(3.0, 0.5), None, 0.5),
+        (Fake(MOST_COARSENESS, 1.0, likelier=-1.0), Fake(3.0, 0.5), None, 0.5),
         (Fake(9.0, 1.0), Fake(3.0, 0.5), Fake(0.0), 6.0),
+        (Fake(MOST_COARSENESS + 1.5, 1.0), Fake(3.0, 0.5), None, 1.0),
+        (Fake(90.0, 1.0), Fake(3.0, 0.5), None, 90.0 - MOST_COARSENESS - 0.5),
+        (Fake(90.0, 1.0), Fake(30.0, 0.5), None, 60.0),
     ],
-    ids=["coarse with it too", "no longer coarse", "nothing stays", "coarse only with it", "as another one was found"],
+    ids=[
+        "coarse with it too",
+        "no longer coarse",
+        "nothing stays",
+        "coarse only with it",
+        "as another one was found",
+        "hardly more than coarse without it",
+        "far more than coarse without it",
+        "far more than coarse with it too",
+    ],
 )
 def test_a_name_explains_what_gradients_do_not(simple: Fake, rich: Fake, found: Fake | None, nats: float) -> None:
-    """A sensor that lags is what gradients explain too: with the lag nothing is left to them, so that all of it is its own."""
+    """A sensor that lags is what gradients explain too: with the lag nothing is left to them, so that all of it is its own.
+
+    What exceeds any coarse network's misfit they cannot explain without the name, unless they must beside it too.
+    """
     told = explained(cast(Trial, simple), cast(Trial, rich), cast("Trial | None", found))
     assert told == pytest.approx(nats)
