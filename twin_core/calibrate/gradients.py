@@ -56,6 +56,8 @@ class WithGradients:
         b_l of every heat flow into its node.
     log_posterior
         As ``Calibration.log_posterior``, averaged over the gradients.
+    flows_K : one (n_rows, n_flows) per sensor
+        The heat flows that set gradients up, see :func:`heat_flows_K`.
     """
 
     problem: Problem
@@ -63,6 +65,28 @@ class WithGradients:
     whitener: Whitener
     biot: tuple[FloatArray, ...]
     log_posterior: float
+    flows_K: list[FloatArray]
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance of the unknowns, whatever all b_l are, under the noise of what is left, (n_unknowns, n_unknowns).
+
+        The upper left of the inverse Hessian over unknowns and b_l (Laplace's method), each residual whitened as its own noise.
+
+        Raises
+        ------
+        ArithmeticError
+            Where sensitivities are not finite, or tell some unknowns from nothing.
+        """
+        n, edges = self.problem.n_unknowns, np.cumsum([0, *(flows.shape[1] for flows in self.flows_K)])
+        _, std = self.problem.prior()
+        hessian = block_diag(np.diag(1.0 / std**2), np.eye(int(edges[-1])) / BIOT**2)
+        for sensor, jacobian in sensor_jacobians(self.problem, self.optimum):
+            own = np.r_[0:n, n + edges[sensor] : n + edges[sensor + 1]]
+            rows = self.whitener.whiten(sensor, np.hstack([jacobian, self.flows_K[sensor]]))
+            hessian[np.ix_(own, own)] += rows.T @ rows
+        if not np.isfinite(hessian).all():
+            raise ArithmeticError("the sensitivities are not finite")
+        return _solved(hessian, np.eye(len(hessian), n))[:n]
 
     @property
     def residuals(self) -> list[FloatArray]:
@@ -149,7 +173,7 @@ def with_gradients(
     against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())
     against += 0.5 * (problem.n_unknowns - problem.n_free) * float(np.log(problem.n_samples))
     log_posterior = whitener.log_likelihood - against - _averaged(whitener, flows_K)
-    return WithGradients(of_mean, found, whitener, tuple(here.biot[own] for own in of_sensor), log_posterior)
+    return WithGradients(of_mean, found, whitener, tuple(here.biot[own] for own in of_sensor), log_posterior, flows_K)
 
 
 def _equations(
@@ -199,8 +223,9 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
     if not right.size:
         return right
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    by_row = scale if right.ndim == 1 else scale[:, None]
     try:
-        return np.asarray(cho_solve(cho_factor(matrix * scale[:, None] * scale), right * scale) * scale)
+        return np.asarray(cho_solve(cho_factor(matrix * scale[:, None] * scale), right * by_row) * by_row)
     except LinAlgError as error:
         raise ArithmeticError("the readings do not tell the unknowns apart") from error
 

@@ -131,7 +131,7 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
         Where it has no solution there.
     """
     problem = simple.fit.problem
-    unknowns = found.optimum.unknowns[shared_unknowns(found, problem)]
+    unknowns = found.optimum.unknowns[shared_unknowns(found.problem, problem)]
     fit = problem.solve(unknowns)
     if not np.isfinite(fit.cost):
         raise ArithmeticError("the heat balance has no solution there")

@@ -238,14 +238,12 @@ def explained(simple: Trial, rich: Trial, found: Trial | None = None) -> float:
     return max(simple.left_beside(share), mean_excess(simple) - credited) - left
 
 
-def shared_unknowns(rich: Calibration, problem: Problem) -> IntArray:
-    """Return where a richer calibration has each unknown of a simpler problem of the same telemetry, (n_unknowns,)."""
-    names = rich.problem.network.parameters.free_names
+def shared_unknowns(rich: Problem, problem: Problem) -> IntArray:
+    """Return where a richer problem has each unknown of a simpler one of the same telemetry, (n_unknowns,)."""
+    names = rich.network.parameters.free_names
     own = [names.index(name) for name in problem.network.parameters.free_names]
-    source = [rich.problem.network.nodes.index(node) for node in problem.network.nodes]
-    starts = [
-        np.arange(rich.problem.n_unknowns)[rich.problem.start_columns(i)][source] for i in range(len(problem.segments))
-    ]
+    source = [rich.network.nodes.index(node) for node in problem.network.nodes]
+    starts = [np.arange(rich.n_unknowns)[rich.start_columns(i)][source] for i in range(len(problem.segments))]
     return np.concatenate([np.array(own, dtype=np.int64), *starts])
 
 

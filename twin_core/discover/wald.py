@@ -8,10 +8,10 @@ from scipy.special import ndtri
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.covariance import trajectory_covariance
+from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration
-from twin_core.discover.trial import Trial, extended, shared_unknowns
+from twin_core.discover.trial import Trial, extended, fitted_effects, shared_unknowns
 from twin_core.effects.base import Effect
 
 LESS = 0.1
@@ -26,9 +26,10 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     of it, whichever is told better: heat that adds up is told as well by both, one that other parameters hang on by a part of
     it, and a limit that is never reached with less of it by the whole. How certain that is follows from the covariance of all
     unknowns by the delta method; the misfit that wanders counts as noise (Huber 1967). Both are in units of each sensor's
-    noise, rms over readings. A load with the period of a declared input, say, may have any size if the capacity follows: its
-    score is near one, however much likelier the readings are with it. That nobody knows how large all heat flows are together
-    does not count: two trajectories tell the same then.
+    noise, rms over readings. Where the readings are likelier beside gradients within the nodes, what these explain does not
+    count as noise, and a size that is told there is told. A load with the period of a declared input, say, may have any size if
+    the capacity follows: its score is near one, however much likelier the readings are with it. That nobody knows how large all
+    heat flows are together does not count: two trajectories tell the same then.
 
     Parameters
     ----------
@@ -47,39 +48,58 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     ArithmeticError
         Where the covariance is not finite.
     """
-    calibration = rich.calibration()
-    covariance = trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
-    if not np.isfinite(covariance).all():
+    calibration, gradients = rich.calibration(), rich.beside_gradients()
+    problem, optimum = calibration.problem, calibration.optimum
+    fitted = [_Fitted(problem, optimum, trajectory_covariance(problem, optimum, calibration.whitener))]
+    if gradients is not None and gradients.log_posterior > calibration.log_posterior:
+        fitted.append(_Fitted(gradients.problem, gradients.optimum, gradients.covariance()))
+    return max(_least_score(simple, rich.effects, one) for one in fitted)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """A network with effects, fitted to trajectories, and the covariance of its unknowns, (n_unknowns, n_unknowns)."""
+
+    problem: Problem
+    optimum: Optimum
+    covariance: FloatArray
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Full parameter name -> calibrated value."""
+        return self.problem.network.parameters.at_free(self.optimum.unknowns[: self.problem.n_free]).as_dict()
+
+
+def _least_score(simple: Trial, effects: Sequence[Effect], fitted: _Fitted) -> float:
+    """Return the least score of the effects of a fitted network that a simpler trial lacks."""
+    if not np.isfinite(fitted.covariance).all():
         raise ArithmeticError("the covariance of the effects is not finite")
-    slopes = stacked_jacobian(
-        calibration.problem,
-        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
-    )
+    blocks = fitted.problem.jacobian_blocks(fitted.optimum.unknowns, fitted.optimum.fit)
+    slopes = stacked_jacobian(fitted.problem, blocks)
     known = {effect.place for effect in simple.effects}
     scores = []
-    for own in rich.present_effects:
+    for own in fitted_effects(effects, fitted.values):
         if own.place not in known:
-            rest = [e for e in rich.effects if e.place != own.place]
-            others = _without(calibration, simple.fit.problem, rest), _with_less(calibration, own)
-            scores.append(max(_score(calibration, slopes, covariance, other) for other in others))
-            scores += _scores_of_bounds(calibration, covariance, own)
+            rest = [e for e in effects if e.place != own.place]
+            others = _without(fitted, simple.fit.problem, rest), _with_less(fitted, own)
+            scores.append(max(_score(fitted, slopes, other) for other in others))
+            scores += _scores_of_bounds(fitted, own)
     return min(scores, default=np.inf)
 
 
-def _scores_of_bounds(rich: Calibration, covariance: FloatArray, effect: Effect) -> list[float]:
+def _scores_of_bounds(fitted: _Fitted, effect: Effect) -> list[float]:
     """Return how many standard deviations lie between each value of a law and the bounds at which it breaks down.
 
     Neither evidence nor score holds on a bound (Self and Liang 1987), and other parameters take such a law's place: a property
     that comes to nothing within what the record visits is none.
     """
-    network, n_free = rich.problem.network, rich.problem.n_free
-    names, values = network.parameters.free_names, network.parameters.at_free(rich.optimum.unknowns[:n_free]).as_dict()
+    names, values = fitted.problem.network.parameters.free_names, fitted.values
     found = []
     for spec in effect.parameter_specs():
         name = f"{effect.label}.{spec.name}"
         if spec.breaks_down and name in names:
             at = names.index(name)
-            value, std = values[name], float(np.sqrt(covariance[at, at]))
+            value, std = values[name], float(np.sqrt(fitted.covariance[at, at]))
             edges = [edge for edge in (spec.lower, spec.upper) if edge is not None]
             found += [abs(value - edge) / std for edge in edges]
     return found
@@ -87,14 +107,14 @@ def _scores_of_bounds(rich: Calibration, covariance: FloatArray, effect: Effect)
 
 @dataclass(frozen=True)
 class _Other:
-    """A calibration without an effect, or with less of it.
+    """A network without an effect, or with less of it.
 
     Attributes
     ----------
     problem, unknowns
         Its problem, of the same telemetry, and where it stands.
     own : (n_unknowns,)
-        Which unknown of the calibration each follows.
+        Which unknown of the fitted network each follows.
     slopes : (n_unknowns,)
         By how much.
     unsolved
@@ -108,16 +128,16 @@ class _Other:
     unsolved: float
 
 
-def _without(rich: Calibration, declared: Problem, rest: Sequence[Effect]) -> _Other:
-    """Return a calibration without the effect that is not among the rest."""
+def _without(fitted: _Fitted, declared: Problem, rest: Sequence[Effect]) -> _Other:
+    """Return a network without the effect that is not among the rest."""
     problem = extended(declared, rest) if rest else declared
-    own = shared_unknowns(rich, problem)
-    return _Other(problem, rich.optimum.unknowns[own], own, np.ones(own.size), np.inf)
+    own = shared_unknowns(fitted.problem, problem)
+    return _Other(problem, fitted.optimum.unknowns[own], own, np.ones(own.size), np.inf)
 
 
-def _with_less(rich: Calibration, effect: Effect) -> _Other:
-    """Return a calibration with less of an effect, which is at its calibrated values."""
-    problem, unknowns = rich.problem, rich.optimum.unknowns.copy()
+def _with_less(fitted: _Fitted, effect: Effect) -> _Other:
+    """Return a network with less of an effect, which is at its calibrated values."""
+    problem, unknowns = fitted.problem, fitted.optimum.unknowns.copy()
     parameters = problem.network.parameters.at_free(unknowns[: problem.n_free])
     less = parameters.updated({p.name: p.value for p in effect.shortened(1.0 - LESS).parameters()})
     amplitudes = {f"{effect.label}.{q.name}" for q in effect.parameter_specs() if q.null is not None}
@@ -128,21 +148,19 @@ def _with_less(rich: Calibration, effect: Effect) -> _Other:
     return _Other(problem, unknowns, np.arange(unknowns.size), slopes, 0.0)
 
 
-def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, other: _Other) -> float:
-    """Return the score of what a calibration has and another one lacks.
+def _score(fitted: _Fitted, slopes: FloatArray, other: _Other) -> float:
+    """Return the score of what a fitted network has and another one lacks.
 
     Parameters
     ----------
-    rich
-        The calibration.
+    fitted
+        The network.
     slopes : (n_samples, n_sensors, n_unknowns)
         Derivatives of its predicted readings, in K.
-    covariance : (n_unknowns, n_unknowns)
-        Of its unknowns.
     other
         What lacks something.
     """
-    optimum, noise_K = rich.optimum, rich.problem.noise_K
+    optimum, noise_K = fitted.optimum, fitted.problem.noise_K
     fit = other.problem.solve(other.unknowns)
     if not np.isfinite(fit.cost):
         return other.unsolved
@@ -150,8 +168,8 @@ def _score(rich: Calibration, slopes: FloatArray, covariance: FloatArray, other:
     change = slopes.copy()
     jacobian = stacked_jacobian(other.problem, other.problem.jacobian_blocks(other.unknowns, fit))
     change[:, :, other.own] -= jacobian * other.slopes
-    valid = np.isfinite(np.concatenate(rich.residuals))
-    variance_K2 = np.einsum("tsi,tsi->ts", change @ covariance, change)
+    valid = np.isfinite(np.concatenate(fitted.problem.residuals(optimum.fit)))
+    variance_K2 = np.einsum("tsi,tsi->ts", change @ fitted.covariance, change)
     squares, variances = (np.where(valid, a / noise_K**2, 0.0).sum() for a in (done_K**2, variance_K2))
     return float(np.sqrt(squares / variances)) if squares > 0.0 else 0.0
 

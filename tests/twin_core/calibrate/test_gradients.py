@@ -1,62 +1,27 @@
 """Gradients within nodes: sensors off the mean of their node, against dense marginal likelihoods and a body that has them."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 from scipy.stats import multivariate_normal
 
-from tests.analytic import laplacian, linear_states
-from tests.helpers import conductive_spec, record_of
-from twin_core._typing import FloatArray
+from tests.helpers import record_of
+from tests.twin_core.calibrate.body_with_gradients import (
+    G_W_PER_K,
+    LEAK_W_PER_K,
+    NOISE_K,
+    ROOM_K,
+    dense_covariance,
+    record,
+    spec,
+)
 from twin_core.calibrate.gradients import BIOT, heat_flows_K, with_gradients
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.effects import REGISTRY
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
-from twin_core.telemetry import Record
-
-NOISE_K = 0.05
-CAPACITY_J_PER_K = np.array([4.0e3, 7.0e3])
-G_W_PER_K, LEAK_W_PER_K, ROOM_K = 2.5, 1.5, 280.0
-OFF = np.array([0.08, -0.1, 0.12, 0.06])
-"""b_l of the conductor and the load at n0, of the conductor and the leak at n1."""
-
-
-def spec() -> dict[str, Any]:
-    data = conductive_spec(
-        2,
-        [(0, 1)],
-        channels={"Q": {"kind": "power", "unit": "W"}},
-        loads=[{"channel": "Q", "node": "n0"}],
-        boundaries={"room": {"value_K": ROOM_K}},
-    )
-    data["conductors"].append({"between": ["n1", "room"], "conductance_W_per_K": {"guess": 1.0}})
-    for sensor in ("T0", "T1"):
-        data["channels"][sensor]["noise_std"] = NOISE_K
-    return data
-
-
-def off_the_mean_K(states_K: FloatArray, power_W: FloatArray) -> FloatArray:
-    """Return what the sensors read beside the mean of their node, (n_times, 2)."""
-    through, lost = G_W_PER_K * (states_K[:, 1] - states_K[:, 0]), LEAK_W_PER_K * (ROOM_K - states_K[:, 1])
-    first = (OFF[0] * through + OFF[1] * power_W) / G_W_PER_K
-    second = (OFF[2] * -through + OFF[3] * lost) / (G_W_PER_K + LEAK_W_PER_K)
-    return np.stack([first, second], axis=1)
-
-
-def record(share: float) -> Record:
-    """Return readings of which a share of the gradients is seen; the heat of a step is seen at its end."""
-    rng = np.random.default_rng(3)
-    time_s, power = 60.0 * np.arange(400), np.repeat(rng.choice([0.0, 40.0, 90.0], 40), 10)
-    rates = -(laplacian(2, [(0, 1)], [G_W_PER_K]) + np.diag([0.0, LEAK_W_PER_K])) / CAPACITY_J_PER_K[:, None]
-    drive = np.stack([power, np.full(400, LEAK_W_PER_K * ROOM_K)], axis=1) / CAPACITY_J_PER_K
-    states = linear_states(rates, drive, np.array([290.0, 288.0]), time_s)
-    seen = np.concatenate([power[:1], power[:-1]])
-    read = states + share * off_the_mean_K(states, seen) + rng.normal(0.0, NOISE_K, (400, 2))
-    return record_of(time_s, Q=power, T0=read[:, 0], T1=read[:, 1])
 
 
 def fitted(share: float) -> Calibration:
@@ -78,6 +43,14 @@ def test_where_there_are_none_they_cost_more_than_they_gain() -> None:
     calibration = fitted(0.0)
     found = with_gradients(calibration.problem, calibration.optimum)
     assert found.log_posterior < calibration.log_posterior
+
+
+def test_the_covariance_is_that_under_gradients_of_any_size() -> None:
+    calibration = fitted(1.0)
+    found = with_gradients(calibration.problem, calibration.optimum)
+    oracle = dense_covariance(found)
+    scale = np.sqrt(np.diag(oracle))
+    assert found.covariance() / scale / scale[:, None] == pytest.approx(oracle / scale / scale[:, None], abs=1e-5)
 
 
 def test_evidence_is_averaged_over_all_gradients() -> None:

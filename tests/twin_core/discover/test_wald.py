@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import curve_fit
 
+from tests.twin_core.calibrate import body_with_gradients
 from twin_core._typing import FloatArray
 from twin_core.calibrate.second_order import fit_network
 from twin_core.discover import wald
@@ -117,19 +118,23 @@ def radiating_trials() -> tuple[Trial, Trial]:
     return simple, try_effects(simple, (radiation,), n_passes=12)
 
 
+def along_trajectories(trial: Trial) -> tuple[wald._Fitted, FloatArray]:
+    """Return what was fitted along trajectories, whatever gradients would explain, and the derivatives of its readings."""
+    calibration = trial.calibration()
+    problem, optimum = calibration.problem, calibration.optimum
+    covariance = wald.trajectory_covariance(problem, optimum, calibration.whitener)
+    slopes = wald.stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
+    return wald._Fitted(problem, optimum, covariance), slopes
+
+
 def test_an_effect_that_carries_most_of_the_heat_has_a_size() -> None:
     """Without the radiation the plate would hang on a film that nothing tells beside it."""
     simple, rich = radiating_trials()
-    calibration = rich.calibration()
-    names = calibration.problem.network.parameters.free_names
-    covariance = wald.trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
-    deviation = dict(zip(names, np.sqrt(np.diag(covariance)), strict=False))
+    fitted, slopes = along_trajectories(rich)
+    names = fitted.problem.network.parameters.free_names
+    deviation = dict(zip(names, np.sqrt(np.diag(fitted.covariance)), strict=False))
     (own,) = (name for name in names if name.endswith("R_m2"))
-    slopes = wald.stacked_jacobian(
-        calibration.problem,
-        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
-    )
-    whole = wald._score(calibration, slopes, covariance, wald._without(calibration, simple.fit.problem, []))
+    whole = wald._score(fitted, slopes, wald._without(fitted, simple.fit.problem, []))
     assert deviation["G:block|room"] > 0.5
     assert least_wald_score(simple, rich) == pytest.approx(1.0 / deviation[own], rel=0.2)
     assert whole < 0.2 / deviation[own]
@@ -142,17 +147,9 @@ def test_of_heat_that_adds_up_a_part_tells_what_the_whole_does(name: str) -> Non
         "input_gain": ({"channel": "P"}, {"g": 1.1}),
     }[name]
     simple, rich = trials(REGISTRY[name](where, values), np.full(N, 1.5), 3000.0)
-    calibration = rich.calibration()
-    covariance = wald.trajectory_covariance(calibration.problem, calibration.optimum, calibration.whitener)
-    slopes = wald.stacked_jacobian(
-        calibration.problem,
-        calibration.problem.jacobian_blocks(calibration.optimum.unknowns, calibration.optimum.fit),
-    )
-    others = (
-        wald._without(calibration, simple.fit.problem, []),
-        wald._with_less(calibration, rich.present_effects[0]),
-    )
-    whole, part = (wald._score(calibration, slopes, covariance, other) for other in others)
+    fitted, slopes = along_trajectories(rich)
+    others = wald._without(fitted, simple.fit.problem, []), wald._with_less(fitted, rich.present_effects[0])
+    whole, part = (wald._score(fitted, slopes, other) for other in others)
     assert part == pytest.approx(whole, rel=1e-3)
 
 
@@ -175,3 +172,33 @@ def test_a_law_that_breaks_down_within_the_record_is_not_told(share_at_room: flo
     effect = REGISTRY["conductance_temperature"]({"nodes": ("block", "room")}, {"beta_per_K": 1e-3}, settings)
     rich = try_effects(simple, (effect,), n_passes=12)
     assert (least_wald_score(simple, rich) > score_needed(4.6)) == is_told
+
+
+def test_a_size_that_gradients_hide_is_told_beside_them() -> None:
+    """What sensors off the mean of their node read wanders along plain trajectories, as if it were noise with a memory.
+
+    The oracle is the delta method by central differences, under dense noise with gradients of any size in its covariance.
+    """
+    fit, calibration = fit_network(load_spec(body_with_gradients.spec()), [body_with_gradients.record(1.0, heat_W=6.0)])
+    simple = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    effect = REGISTRY["constant_heat_load"]({"node": "n0"}, {"Q_W": 4.0})
+    rich = try_effects(simple, (effect,), n_passes=12)
+    beside, (own,) = rich.beside_gradients(), rich.present_effects
+    assert beside is not None
+    assert beside.log_posterior > rich.calibration().log_posterior
+    problem, covariance = beside.problem, body_with_gradients.dense_covariance(beside)
+    at = problem.network.parameters.free_names.index(f"{own.label}.Q_W")
+
+    def done_K(unknowns: FloatArray) -> FloatArray:
+        without = unknowns.copy()
+        without[at] = 0.0
+        return problem.solve(unknowns).predicted_K[0] - problem.solve(without).predicted_K[0]
+
+    steps = 1e-3 * np.diag(np.sqrt(np.diag(covariance)))
+    unknowns = beside.optimum.unknowns
+    slopes = np.array([(done_K(unknowns + h) - done_K(unknowns - h)).ravel() / (2.0 * h.max()) for h in steps]).T
+    variance = np.einsum("ri,ij,rj->", slopes, covariance, slopes)
+    score = least_wald_score(simple, rich)
+    assert score == pytest.approx(np.sqrt((done_K(unknowns) ** 2).sum() / variance), rel=0.02)
+    fitted, slopes = along_trajectories(rich)
+    assert wald._score(fitted, slopes, wald._with_less(fitted, own)) < 0.5 * score
