@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.covariance import trajectory_covariance
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Problem
@@ -52,7 +53,8 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     problem, optimum = calibration.problem, calibration.optimum
     fitted = [_Fitted(problem, optimum, trajectory_covariance(problem, optimum, calibration.whitener))]
     if gradients is not None and gradients.log_posterior > calibration.log_posterior:
-        fitted.append(_Fitted(gradients.problem, gradients.optimum, gradients.covariance()))
+        covariance = attempted(gradients.covariance, "the covariance beside gradients within nodes", [])
+        fitted += [] if covariance is None else [_Fitted(gradients.problem, gradients.optimum, covariance)]
     return max(_least_score(simple, rich.effects, one) for one in fitted)
 
 
