@@ -96,7 +96,7 @@ def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms, postgres: str) -> 
     epoch = rooms.renew("one").epochs[slot_of(rooms.twin)]
     other = Database(postgres)
     order: list[str] = []
-    is_under_way, may_end = threading.Event(), threading.Event()
+    is_under_way, may_end, all_told = threading.Event(), threading.Event(), threading.Barrier(3)
 
     def slowly(connection: Connection) -> None:
         ownership.check(connection, rooms.twin, epoch)
@@ -104,11 +104,15 @@ def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms, postgres: str) -> 
         assert may_end.wait(30)
         order.append("written")
 
-    rooms.database.submit_to(rooms.twin, lambda result, error: order.append(f"answered {error}"), slowly)
+    def tell(what: str) -> None:
+        order.append(what)
+        all_told.wait(30)
+
+    rooms.database.submit_to(rooms.twin, lambda result, error: tell(f"answered {error}"), slowly)
     assert is_under_way.wait(30)
     other.submit(lapse, "one").result(30)
     takeover = other.submit(ownership.renew, "two", LEASE_US)
-    takeover.add_done_callback(lambda done: order.append("taken over"))
+    takeover.add_done_callback(lambda done: tell("taken over"))
     with psycopg.connect(postgres, autocommit=True) as server:
         waits = "SELECT 1 FROM pg_stat_activity WHERE wait_event_type = 'Lock' AND query LIKE 'UPDATE head SET epoch%'"
         while server.execute(waits).fetchone() is None:
@@ -116,6 +120,7 @@ def test_a_takeover_waits_for_a_write_under_way(rooms: Rooms, postgres: str) -> 
             time.sleep(0.05)
     may_end.set()
     assert slot_of(rooms.twin) in takeover.result(30).epochs
+    all_told.wait(30)  # both are told by threads of their own
     other.close()
     assert order[0] == "written" and sorted(order[1:]) == ["answered None", "taken over"]
 
