@@ -55,7 +55,11 @@ def least_wald_score(simple: Trial, rich: Trial) -> float:
     if gradients is not None and gradients.log_posterior > calibration.log_posterior:
         covariance = attempted(gradients.covariance, "the covariance beside gradients within nodes", [])
         fitted += [] if covariance is None else [_Fitted(gradients.problem, gradients.optimum, covariance)]
-    return max(_least_score(simple, rich.effects, one) for one in fitted)
+    new = [effect for effect in rich.effects if effect.place not in {known.place for known in simple.effects}]
+    size = max(_least_score(simple, rich.effects, new, one) for one in fitted)
+    # A law must hold where it is handed out, which is along plain trajectories.
+    bounds = (score for effect in new for score in _scores_of_bounds(fitted[0], effect))
+    return min([size, *bounds])
 
 
 @dataclass(frozen=True)
@@ -72,20 +76,17 @@ class _Fitted:
         return self.problem.network.parameters.at_free(self.optimum.unknowns[: self.problem.n_free]).as_dict()
 
 
-def _least_score(simple: Trial, effects: Sequence[Effect], fitted: _Fitted) -> float:
-    """Return the least score of the effects of a fitted network that a simpler trial lacks."""
+def _least_score(simple: Trial, effects: Sequence[Effect], new: Sequence[Effect], fitted: _Fitted) -> float:
+    """Return the least score of the new ones among the effects of a fitted network, which a simpler trial lacks."""
     if not np.isfinite(fitted.covariance).all():
         raise ArithmeticError("the covariance of the effects is not finite")
     blocks = fitted.problem.jacobian_blocks(fitted.optimum.unknowns, fitted.optimum.fit)
     slopes = stacked_jacobian(fitted.problem, blocks)
-    known = {effect.place for effect in simple.effects}
     scores = []
-    for own in fitted_effects(effects, fitted.values):
-        if own.place not in known:
-            rest = [e for e in effects if e.place != own.place]
-            others = _without(fitted, simple.fit.problem, rest), _with_less(fitted, own)
-            scores.append(max(_score(fitted, slopes, other) for other in others))
-            scores += _scores_of_bounds(fitted, own)
+    for own in fitted_effects(new, fitted.values):
+        rest = [e for e in effects if e.place != own.place]
+        others = _without(fitted, simple.fit.problem, rest), _with_less(fitted, own)
+        scores.append(max(_score(fitted, slopes, other) for other in others))
     return min(scores, default=np.inf)
 
 

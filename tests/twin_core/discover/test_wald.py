@@ -174,7 +174,7 @@ def test_a_law_that_breaks_down_within_the_record_is_not_told(share_at_room: flo
     assert (least_wald_score(simple, rich) > score_needed(4.6)) == is_told
 
 
-def test_a_size_that_gradients_hide_is_told_beside_them() -> None:
+def test_a_size_that_gradients_hide_is_told_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """What sensors off the mean of their node read wanders along plain trajectories, as if it were noise with a memory.
 
     The oracle is the delta method by central differences, under dense noise with gradients of any size in its covariance.
@@ -202,3 +202,6 @@ def test_a_size_that_gradients_hide_is_told_beside_them() -> None:
     assert score == pytest.approx(np.sqrt((done_K(unknowns) ** 2).sum() / variance), rel=0.02)
     fitted, slopes = along_trajectories(rich)
     assert wald._score(fitted, slopes, wald._with_less(fitted, own)) < 0.5 * score
+    on_a_bound = 0.3, np.inf  # along trajectories, and beside gradients
+    monkeypatch.setattr(wald, "_scores_of_bounds", lambda one, effect: [on_a_bound[one.problem is problem]])
+    assert least_wald_score(simple, rich) == on_a_bound[0]
