@@ -5,7 +5,7 @@ name or another by many nats that say nothing. There, names that explain as much
 itself hardly tells from the best one.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -17,7 +17,15 @@ from twin_core.discover import policy
 from twin_core.discover.evidence import weigh
 from twin_core.discover.form import acts_at
 from twin_core.discover.judge import Finding, Judged, Search, once_each
-from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, each_start, refined, screened
+from twin_core.discover.shortlist import (
+    UNDECLARED_SHARES,
+    best_of_each_place,
+    each_start,
+    refined,
+    screened,
+    screened_beside_gradients,
+    shortlist,
+)
 from twin_core.discover.trial import (
     Trial,
     about_trajectory,
@@ -36,6 +44,10 @@ law, or for a neighbouring place, by so much more than linear responses tell tha
 
 N_BEFORE = 8
 """Names that are fitted at most from the simpler model as it was fitted, of each linear screening about it."""
+
+N_BESIDE_GRADIENTS = 6
+"""Names that are fitted at most of those that stand out beside gradients within the nodes, where the right one mostly comes
+first: heat that wanders at the nodes, or trajectories alone, would put it behind dozens of others."""
 
 N_VARIED = 6
 """Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
@@ -66,11 +78,16 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     what = f"names that may explain what {own.label} does"
     near = state.attempt(partial(_near, simple, bare, found, own, known), what) or []
     before = state.attempt(partial(_near_before, simple, own, known), what) or []
-    options = [*((bare, effect) for effect in near), *((fitted_before, effect) for effect in before)]
+    beside = state.attempt(partial(_near_beside_gradients, simple, own, known), what) or []
+    options = [
+        *((effect, [bare]) for effect in near),
+        *((effect, [fitted_before]) for effect in before),
+        *((effect, _starts_beside_gradients(simple)) for effect in beside),
+    ]
     fitted = state.attempt_each(
         [
-            (partial(_explaining, simple, start, effect, state.trial, least), f"{effect.label} instead of {own.label}")
-            for start, effect in options
+            (partial(_explaining, simple, starts, effect, state.trial, least), f"{effect.label} instead of {own.label}")
+            for effect, starts in options
         ]
     )
     best: dict[Place, Trial] = {}
@@ -138,10 +155,41 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
     return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
 
 
-def _explaining(simple: Trial, start: Calibration, effect: Effect, found: Trial, least: float) -> Trial | None:
-    """Return an effect on top of a trial, fitted on trajectories, if it explains so much, gradients as with what was found."""
-    trial = try_on_trajectories(simple, (*simple.present_effects, effect), start)
-    return None if trial is None or explained(simple, trial, found) < least else trial
+def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place]) -> list[Effect]:
+    """Return the names that stand out beside gradients within the nodes, about the simpler model fitted beside them."""
+    screened_there = screened_beside_gradients(simple, fallback=False)
+    if screened_there is None:
+        return []
+    about, screenings = screened_there
+    most = len(own.parameter_specs())
+    rankings = [best_of_each_place(screening.probes, simple.n_samples) for screening in screenings]
+    others = [
+        [p for p in ranked if p.effect.place not in known and len(p.effect.parameter_specs()) <= most]
+        for ranked in rankings
+    ]
+    return refined(about, shortlist(others, 0.0, N_BESIDE_GRADIENTS))
+
+
+def _starts_beside_gradients(simple: Trial) -> list[Calibration]:
+    """Return the simpler model fitted to trajectories, and beside gradients within the nodes."""
+    calibration, gradients = simple.calibration(), simple.beside_any_gradients()
+    if gradients is None:
+        return [calibration]
+    return [calibration, replace(calibration, problem=gradients.problem, optimum=gradients.optimum)]
+
+
+def _explaining(
+    simple: Trial, starts: Sequence[Calibration], effect: Effect, found: Trial, least: float
+) -> Trial | None:
+    """Return an effect on top of a trial, fitted on trajectories, if it is as good a name as what was found.
+
+    It explains so much, gradients as with what was found, or the readings hardly tell it from that, or are likelier.
+    """
+    trial = try_on_trajectories(simple, (*simple.present_effects, effect), *starts)
+    if trial is None:
+        return None
+    as_much = explained(simple, trial, found) >= least
+    return trial if as_much or trial.log_evidence() > found.log_evidence() - policy.ALTERNATIVE_NATS else None
 
 
 def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:

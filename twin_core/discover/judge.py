@@ -339,7 +339,20 @@ def simplest_first(judged: Sequence[Judged]) -> list[Judged]:
     """Return options, best first, with the simplest of those in front that the data hardly tell from the best."""
     close = [j for j in judged if j is judged[0] or is_close(j, judged[0])]
     rest = [j for j in judged if all(j is not c for c in close)]
-    return sorted(close, key=lambda j: j.trial.fit.problem.n_free) + rest
+    return sorted(close, key=complexity) + rest
+
+
+def complexity(judged: Judged) -> tuple[int, int]:
+    """Return how many parameters effects have, and how many of them go against what is declared of their boundary.
+
+    What the declared network radiates to alone is deep space mostly, where nothing conducts or carries heat away: of two names
+    that the data hardly tell apart, the one by radiation is told first.
+    """
+    spec = judged.trial.fit.problem.network.spec
+    joined = {end for conductor in spec.conductors for end in conductor.between}
+    radiated_to = {radiator.sink for radiator in spec.radiators} - joined
+    by_matter = [e for e in judged.effects if "node" in e.where and e.where.get("boundary") in radiated_to]
+    return sum(len(effect.parameter_specs()) for effect in judged.effects), len(by_matter)
 
 
 def foresight_of(judged: Judged) -> float:

@@ -19,6 +19,7 @@ from twin_core.discover.judge import (
     Judged,
     Search,
     Without,
+    complexity,
     examine,
     foresight_of,
     is_close,
@@ -228,18 +229,19 @@ def tell_alternatives(state: Search, needed: float) -> None:
 
 
 def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
-    """Exchange a finding for the best of its alternatives that passes, if it is simpler, far likelier, or predicts better.
+    """Exchange a finding for the best of its alternatives that passes, if it is simpler, likelier, or predicts better.
 
-    A simpler one leads that the readings hardly tell from it. The first look ranks by linear responses, and what it left out may
-    turn out to explain more: likelier by the odds asked for, or leaving less and predicting better what it was not fitted to.
-    The finding is an alternative then.
+    A simpler one leads that the readings hardly tell from it, and of those as simple the likeliest. The first look ranks by
+    linear responses, and what it left out may turn out to explain more: likelier by the odds asked for, or leaving less and
+    predicting better what it was not fitted to. The finding is an alternative then.
     """
     finding = state.findings[position]
     own = finding.judged
     ranked = sorted(finding.alternatives, key=worth)
-    better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in ranked if _freedom(j) < _freedom(own) and is_close(j, own)]
+    simple = [j for j in ranked if is_close(j, own) and (complexity(j), worth(j)) < (complexity(own), worth(own))]
+    better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in simple]
     better += [(j, needed, np.inf) for j in ranked if worth(j) < worth(own) - needed]
-    no_freer = [j for j in ranked if _freedom(j) <= _freedom(own)]
+    no_freer = [j for j in ranked if complexity(j)[0] <= complexity(own)[0]]
     asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in no_freer)
     less = [(value, j) for j, value in asked if value is not None and value < state.trial.unexplained()]
     better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
@@ -250,11 +252,6 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
             alternatives = tuple(sorted((finding.judged, *others), key=worth))
             state.findings[position] = replace(state.findings[position], alternatives=alternatives)
             return
-
-
-def _freedom(judged: Judged) -> int:
-    """Return how many parameters a set of effects has."""
-    return sum(len(effect.parameter_specs()) for effect in judged.effects)
 
 
 def _attempted_without(state: Search, places: Collection[object]) -> Without | None:

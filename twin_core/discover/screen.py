@@ -1,13 +1,15 @@
 """Screening: how much of the residual each candidate could explain, beyond what the calibrated parameters could.
 
-The linearised response of the sensors to every candidate is propagated at once about the smoothed measured temperatures,
-whitened in the metric of sensor noise and undeclared heat, and projected off what the calibrated parameters can mimic.
+The linearised response of the sensors to every candidate is propagated at once about temperatures close to the measured ones,
+whitened in a metric of what else the readings hold (see :mod:`twin_core.discover.metric`), and projected off what the calibrated
+parameters can mimic.
 """
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +17,8 @@ import numpy as np
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
 from twin_core.calibrate.starting import channel_levels
-from twin_core.calibrate.undeclared.model import HeatFit, Nominal, parameter_columns, whiten
+from twin_core.calibrate.undeclared.model import HeatFit, Nominal
+from twin_core.discover.metric import Metric, beside_heat
 from twin_core.effects.base import Effect, Survey
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.surroundings import surround
@@ -147,38 +150,6 @@ def responses(fit: HeatFit, survey: Survey, columns: Sequence[Column]) -> list[F
     return blocks
 
 
-def _whitened(fit: HeatFit, blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return columns of all segments, whitened and flattened to (n_rows, n_columns)."""
-    parts = [
-        whiten(fit.problem, fit.undeclared, nominal, block)[0].reshape(block.shape[0] * block.shape[1], block.shape[2])
-        for nominal, block in zip(fit.nominals, blocks, strict=True)
-    ]
-    return parts[0] if len(parts) == 1 else np.concatenate(parts)
-
-
-def nuisance_basis(fit: HeatFit) -> tuple[FloatArray, FloatArray]:
-    """Return an orthonormal basis of what the parameters can mimic, and the residual projected off it.
-
-    Returns
-    -------
-    (n_rows + n_free, n_basis), (n_rows + n_free,)
-        Whitened; the last n_free rows are the priors.
-    """
-    return _nuisance(fit, [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals])
-
-
-def _nuisance(fit: HeatFit, blocks: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    parameters = fit.problem.network.parameters
-    std = parameters.prior_std
-    design = np.vstack([_whitened(fit, blocks), np.diag(1.0 / std)])
-    data = _whitened(fit, [n.residual_K[:, :, None] for n in fit.nominals])[:, 0]
-    rows = np.concatenate([data, (parameters.free - fit.free) / std])
-    scale = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
-    left, singular, _ = np.linalg.svd(design / scale, full_matrices=False)
-    basis = left[:, singular > 1e-10 * singular[0]] if singular.size else left
-    return basis, rows - basis @ (basis.T @ rows)
-
-
 def screen(fit: HeatFit, survey: Survey, candidates: Iterable[Effect]) -> Screening:
     """Screen candidate effects against the innovations of a fit.
 
@@ -206,19 +177,22 @@ def screen_sizes(
 
     The responses are the same for all; only their metric changes.
     """
-    nuisance = [parameter_columns(fit.problem, fit.values, n) for n in fit.nominals]
-    sized = [replace(fit, undeclared=replace(fit.undeclared, std_W=share * fit.undeclared.std_W)) for share in shares]
-    n_tried, probes, under_way = 0, [list[Probe]() for _ in shares], list[Future[list[Probe]]]()
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # sizes side by side, while the next responses are calculated
-        grounds = list(pool.map(lambda one: _nuisance(one, nuisance), sized))
+    return screen_in([partial(beside_heat, fit, share) for share in shares], fit, survey, candidates)
+
+
+def screen_in(
+    metrics: Sequence[Callable[[], Metric]], fit: HeatFit, survey: Survey, candidates: Iterable[Effect]
+) -> list[Screening]:
+    """Screen candidate effects in several metrics, about the temperatures of one fit: see :func:`screen`."""
+    n_tried, probes, under_way = 0, [list[Probe]() for _ in metrics], list[Future[list[Probe]]]()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # metrics side by side, while the next responses are calculated
+        built = [pool.submit(metric) for metric in metrics]
+        grounds = [metric.result() for metric in built]
         for effects, edges, blocks in _portions(fit, survey, candidates):
             n_tried += len(effects)
             for found, done in zip(probes, under_way, strict=False):
                 found += done.result()
-            under_way = [
-                pool.submit(_probes, effects, edges, one, blocks, *ground)
-                for one, ground in zip(sized, grounds, strict=True)
-            ]
+            under_way = [pool.submit(_probes, effects, edges, metric, blocks) for metric in grounds]
         for found, done in zip(probes, under_way, strict=False):
             found += done.result()
     return [Screening(tuple(sorted(found, key=lambda p: -p.gain)), n_tried) for found in probes]
@@ -231,10 +205,11 @@ def projected_responses(fit: HeatFit, survey: Survey, effects: Sequence[Effect])
     -------
     list of (n_rows, n_amplitudes), (n_rows,)
     """
-    basis, residual = nuisance_basis(fit)
+    metric = beside_heat(fit)
+    basis, residual = metric.basis, metric.residual
     found: list[FloatArray] = []
     for _, edges, blocks in _portions(fit, survey, effects):
-        whitened = _whitened(fit, blocks)
+        whitened = metric.whiten(blocks)
         whitened = np.vstack([whitened, np.zeros((basis.shape[0] - whitened.shape[0], whitened.shape[1]))])
         projected = whitened - basis @ (basis.T @ whitened)
         found += [projected[:, a:b] for a, b in pairwise(edges)]
@@ -263,21 +238,16 @@ def _portions(
 
 
 def _probes(
-    effects: Sequence[Effect],
-    edges: Sequence[int],
-    fit: HeatFit,
-    blocks: Sequence[FloatArray],
-    basis: FloatArray,
-    residual: FloatArray,
+    effects: Sequence[Effect], edges: Sequence[int], metric: Metric, blocks: Sequence[FloatArray]
 ) -> list[Probe]:
     """Return the probes of candidates that the data tell and whose best amplitudes are physical.
 
-    ``edges`` are where the columns of each begin and end in the responses ``blocks``, which a fit whitens. ``basis``
-    (n_rows + n_free, n_basis) is orthonormal, off it ``residual`` (n_rows + n_free,) is projected: P'P = W'W - (B'W)'(B'W) and
-    P'r = W'r of the projected responses P, which need not be formed. Candidates with equally many amplitudes go through the
-    algebra at once; those whose responses are no numbers are left out.
+    ``edges`` are where the columns of each begin and end in the responses ``blocks``. The basis of the metric is orthonormal,
+    off it the residual is projected: P'P = W'W - (B'W)'(B'W) and P'r = W'r of the projected responses P, which need not be
+    formed. Candidates with equally many amplitudes go through the algebra at once; those whose responses are no numbers are
+    left out.
     """
-    whitened = _whitened(fit, blocks)
+    whitened, basis, residual = metric.whiten(blocks), metric.basis, metric.residual
     n_rows = whitened.shape[0]
     along, inside = residual[:n_rows] @ whitened, basis[:n_rows].T @ whitened
     columns = np.ascontiguousarray(whitened.T)

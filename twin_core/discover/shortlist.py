@@ -1,12 +1,14 @@
 """The shortlist: every candidate of the registry, screened, and the few that are worth a refit."""
 
 from collections.abc import Collection, Sequence
+from functools import partial
 
 import numpy as np
 
 from twin_core.calibrate.undeclared.model import HeatFit
-from twin_core.discover.screen import Probe, Screening, screen, screen_sizes, survey_of
-from twin_core.discover.trial import Trial
+from twin_core.discover.metric import beside_gradients
+from twin_core.discover.screen import Probe, Screening, screen, screen_in, screen_sizes, survey_of
+from twin_core.discover.trial import Trial, about_trajectory
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Place, Survey
 
@@ -47,6 +49,21 @@ def screened(
     """
     survey, effects = candidates(trial, fit, fallback=fallback, nodes=nodes)
     return screen_sizes(fit, shares, survey, effects)
+
+
+def screened_beside_gradients(trial: Trial, *, fallback: bool) -> tuple[HeatFit, list[Screening]] | None:
+    """Screen the candidates of a trial about its trajectories beside gradients within the nodes, and return where.
+
+    Once against a misfit that wanders at the sensors as what stays does, once against their noise alone. None where trajectories
+    leave nothing that gradients could explain.
+    """
+    gradients = trial.beside_any_gradients()
+    if gradients is None:
+        return None
+    about = about_trajectory(gradients.problem, gradients.optimum)
+    survey, effects = candidates(trial, about, fallback=fallback)
+    metrics = [partial(beside_gradients, gradients, is_white=is_white) for is_white in (False, True)]
+    return about, screen_in(metrics, about, survey, effects)
 
 
 def shortlist(

@@ -110,6 +110,14 @@ class Trial:
         None where trajectories leave no more than chance, so that gradients have nothing to explain, where far more would
         stay beside them than any coarse network leaves, and where their arithmetic fails.
         """
+        return self._with_gradients(FAR_MORE * policy.MOST_COARSENESS)
+
+    @once
+    def beside_any_gradients(self) -> WithGradients | None:
+        """The same, however much stays beside them: what is missing is looked for there."""
+        return self.beside_gradients() or self._with_gradients(np.inf)
+
+    def _with_gradients(self, most_left: float) -> WithGradients | None:
         calibration = self.calibration()
         if self.excess().mean() <= by_chance(self.n_samples):
             return None
@@ -118,8 +126,7 @@ class Trial:
         if below is not None:
             own = problem.network.parameters.at_free(optimum.unknowns[: problem.n_free]).as_dict()
             near = carried_over(below.problem, below.optimum.unknowns, problem, own)
-        work = partial(with_gradients, problem, optimum, near, FAR_MORE * policy.MOST_COARSENESS)
-        return attempted(work, "gradients within nodes", [])
+        return attempted(partial(with_gradients, problem, optimum, near, most_left), "gradients within nodes", [])
 
     @once
     def along_trajectories(self) -> float:
@@ -291,26 +298,23 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
 
 
 def try_on_trajectories(
-    base: Trial, effects: Sequence[Effect], start: Calibration | None = None, *, beside_heat: bool = False
+    base: Trial, effects: Sequence[Effect], *starts: Calibration, beside_heat: bool = False
 ) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
-    Or from another ``start`` of the simpler problem; with ``beside_heat`` from its fit beside undeclared heat too, and
-    the better one counts: where much is missing, parameters that are to follow long trajectories alone lie far from where the
+    Or from other ``starts`` of the simpler problem; with ``beside_heat`` from its fit beside undeclared heat too, and
+    the best one counts: where much is missing, parameters that are to follow long trajectories alone lie far from where the
     effect belongs. Where the balance has no solution there, what is new starts smaller; None where it has none even so. The
     undeclared heat is sized about the result, for a later look.
     """
     problem = extended(base.fit.problem, effects)
-    along = start or base.calibration()
-    starts = [
-        (along.problem, along.optimum.unknowns),
-        *([(base.fit.problem, base.fit.unknowns())] if beside_heat else []),
-    ]
+    along = [(start.problem, start.optimum.unknowns) for start in starts or (base.calibration(),)]
+    along += [(base.fit.problem, base.fit.unknowns())] if beside_heat else []
     there = {effect.place for effect in base.effects}
     for share in (1.0, *SHORTER_SHARES):
         some = [e if share == 1.0 or e.place in there else e.shortened(share) for e in effects]
         own = {p.name: p.value for effect in some for p in effect.parameters()}
-        optima = [minimise(problem, carried_over(*simpler, problem, own)) for simpler in starts]
+        optima = [minimise(problem, carried_over(*simpler, problem, own)) for simpler in along]
         optimum = min(optima, key=lambda o: np.inf if o.status == "no_solution" else o.fit.cost)
         if optimum.status != "no_solution":
             break

@@ -1,6 +1,7 @@
 """Stubs of trials and findings of which only what decides counts."""
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -35,7 +36,17 @@ CHANCE = VISIBLE_COARSENESS * float(np.sqrt(2.0 / N_READINGS))
 
 @dataclass
 class Problem:
+    """A problem of which only the number of its parameters and what its network is declared to touch count."""
+
     n_free: int
+    conducted: tuple[str, ...] = ()
+    radiated: tuple[str, ...] = ()
+
+    @property
+    def network(self) -> SimpleNamespace:
+        conductors = [SimpleNamespace(between=("a", boundary)) for boundary in self.conducted]
+        radiators = [SimpleNamespace(node="a", sink=boundary) for boundary in self.radiated]
+        return SimpleNamespace(spec=SimpleNamespace(conductors=conductors, radiators=radiators))
 
 
 @dataclass

@@ -1,5 +1,6 @@
 """Alternatives in a coarse network: each place is asked once, from its best fit, and weighed with its heat fitted if need be."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ from twin_core.discover import alternatives
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Search
-from twin_core.discover.policy import REPEATABLE_SHARE
+from twin_core.discover.policy import ALTERNATIVE_NATS, REPEATABLE_SHARE
 from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
 
@@ -23,6 +24,8 @@ class Fits:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], nats: tuple[float, float]) -> None:
         self.rough, self.fine = dict(zip(("bare", "fitted"), left, strict=True)), nats
         self.settled: list[float] = []
+        self.beside: list[str] = []
+        self.likelier = -1e3
         self.simple: Any = stub(left=BEFORE)
         self.simple.present_effects, self.simple.calibration = (), lambda: "fitted"
         self.found = self.with_a(LEFT)
@@ -30,6 +33,7 @@ class Fits:
             "_bare": lambda simple, found: "bare",
             "_near": lambda *given: [load("b")],
             "_near_before": lambda *given: [load("b")],
+            "_near_beside_gradients": lambda *given: [load(node) for node in self.beside],
             "try_on_trajectories": self.tried,
             "resettled": self.resettled,
             "weigh": lambda simple, rich, n_tried: Evidence(rich.nats, 0.0),
@@ -45,10 +49,11 @@ class Fits:
     def trial(self, left: float, nats: float) -> Any:
         made: Any = stub(load("b"), left=left)
         made.nats = nats
+        made.log_evidence = lambda: self.likelier
         return made
 
-    def tried(self, simple: Trial, effects: tuple[Effect, ...], start: str) -> Any:
-        return self.trial(self.rough[start], self.fine[0])
+    def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any) -> Any:
+        return self.trial(min(self.rough[str(start)] for start in starts), self.fine[0])
 
     def resettled(self, simple: Trial, rich: Any) -> Any:
         self.settled.append(rich.unexplained())
@@ -92,6 +97,29 @@ def test_an_alternative_explains_all_but_a_tenth(
     monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], told: list[str]
 ) -> None:
     assert Fits(monkeypatch, left, (9.0, 9.0)).told() == told
+
+
+@pytest.mark.parametrize(
+    ("likelier", "told"), [(-ALTERNATIVE_NATS, []), (-ALTERNATIVE_NATS + JUST, ["b"]), (90.0, ["b"])]
+)
+def test_an_alternative_that_the_readings_hardly_tell_from_what_was_found_may_explain_less(
+    monkeypatch: pytest.MonkeyPatch, likelier: float, told: list[str]
+) -> None:
+    """Parameters make up for a neighbouring place along trajectories; beside gradients the right one was 75 nats likelier."""
+    fits = Fits(monkeypatch, (BEFORE, BEFORE), (9.0, 9.0))
+    fits.likelier = likelier
+    assert fits.told() == told
+
+
+def test_what_stands_out_beside_gradients_is_fitted_from_both_of_their_optima(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits = Fits(monkeypatch, (BEFORE, BEFORE), (9.0, 9.0))
+    gradients = SimpleNamespace(problem="beside", optimum="gradients")
+    fits.beside, fits.simple.beside_any_gradients = ["b"], lambda: gradients
+    fits.rough["beside gradients"] = LEFT
+    monkeypatch.setattr(alternatives, "replace", lambda calibration, problem, optimum: f"{problem} {optimum}")
+    assert fits.told() == ["b"]
+    fits.simple.beside_any_gradients = lambda: None
+    assert fits.told() == []
 
 
 @pytest.mark.parametrize("left", [CHANCE, CHANCE + JUST])

@@ -102,8 +102,31 @@ def test_alternatives(behind: float, close: bool) -> None:
 
 
 def test_the_simplest_of_those_that_the_data_hardly_tell_comes_first() -> None:
-    options = [judged("a", 50.0, n_free=5), judged("b", 48.0, n_free=3), judged("c", 40.0, n_free=1)]
+    film = REGISTRY["nonlinear_convection"]({"node": "a", "boundary": "bus"}, {"k": 1.0, "p": 1.0})
+    options = [Judged((film,), Evidence(50.0, 0.0), stub(film)), judged("b", 48.0), judged("c", 40.0)]
     assert [j.effects[0].where["node"] for j in simplest_first(options)] == ["b", "a", "c"]
+
+
+@pytest.mark.parametrize(
+    ("behind", "conducted", "leads"),
+    [
+        (ALTERNATIVE_NATS - JUST, (), "radiation_to_sink"),
+        (ALTERNATIVE_NATS, (), "leak_to_boundary"),
+        (ALTERNATIVE_NATS - JUST, ("space",), "leak_to_boundary"),
+    ],
+    ids=["hardly told apart", "told apart", "matter joins them"],
+)
+def test_what_is_declared_to_be_radiated_to_takes_radiation(
+    behind: float, conducted: tuple[str, ...], leads: str
+) -> None:
+    """Deep space conducts nothing: of a leak there and radiation, hardly told apart, the latter is told first."""
+    leak = REGISTRY["leak_to_boundary"]({"node": "a", "boundary": "space"}, {"G_W_per_K": 1.0})
+    radiation = REGISTRY["radiation_to_sink"]({"node": "a", "sink": "space"}, {"R_m2": 1.0})
+    options = [Judged((e,), Evidence(50.0, 0.0), stub(e)) for e in (leak, radiation)]
+    options[1] = replace(options[1], evidence=Evidence(50.0 - behind, 0.0))
+    for option in options:
+        cast(Any, option.trial).fit.problem = Problem(3, conducted, ("space",))
+    assert simplest_first(options)[0].effects[0].name == leads
 
 
 def test_every_set_of_effects_counts_once_at_its_best() -> None:

@@ -444,6 +444,19 @@ def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
         assert finding.effects[0].where == {"node": "a"}
 
 
+@pytest.mark.parametrize(("ahead", "leads"), [(JUST, "b"), (0.0, "a")])
+def test_the_likeliest_of_those_as_simple_leads(monkeypatch: pytest.MonkeyPatch, ahead: float, leads: str) -> None:
+    found, told = judged("a", 90.0), Finding(judged("a", 90.0), (judged("b", 90.0 + ahead),))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
+    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(90.0 + ahead, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (judged, False))
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    assert [e.where["node"] for e in state.findings[0].effects] == [leads]
+
+
 @pytest.mark.parametrize(
     ("left", "foresight", "leads"),
     [(2.0 - JUST, 0.9 * FORESIGHT - JUST, "b"), (2.0 - JUST, 0.9 * FORESIGHT, "a"), (2.0, 0.1, "a")],

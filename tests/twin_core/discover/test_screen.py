@@ -11,8 +11,8 @@ from tests.helpers import every_term_network
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.calibrate.undeclared.model import HeatFit, UndeclaredHeat, linearise
 from twin_core.discover import screen as screening_module
+from twin_core.discover.metric import beside_heat
 from twin_core.discover.screen import (
-    nuisance_basis,
     projected_responses,
     responses,
     screen,
@@ -143,7 +143,8 @@ def test_a_late_sink_is_the_lag_of_its_channel() -> None:
 
 def test_the_residual_is_projected_off_what_parameters_can_mimic() -> None:
     fit = fit_of(problem())
-    basis, residual = nuisance_basis(fit)
+    metric = beside_heat(fit)
+    basis, residual = metric.basis, metric.residual
     np.testing.assert_allclose(basis.T @ basis, np.eye(basis.shape[1]), atol=1e-9)
     np.testing.assert_allclose(basis.T @ residual, 0.0, atol=1e-9)
 
@@ -166,7 +167,8 @@ def test_the_gain_is_that_of_least_squares() -> None:
         REGISTRY["missing_conductor"]({"nodes": ["a", "c"]}, {"G_W_per_K": 0.0}),
     ]
     screening = screen(fit, survey, candidates)
-    basis, residual = nuisance_basis(fit)
+    metric = beside_heat(fit)
+    basis, residual = metric.basis, metric.residual
     assert screening.n_tried == 4
     assert screening.probes[0].effect.where == {"channel": "Q_a"}
     assert screening.probes[0].effect.values["g"] == pytest.approx(1.3, abs=0.1)
