@@ -121,9 +121,16 @@ def coarse_problem(problem: Problem, step_s: float, n_samples: int | None = None
 
 
 def thinned(spec: TwinSpec, record: Record, stride: int) -> Record:
-    """Return every ``stride``-th sample; heat that holds between samples is averaged, so that none is lost."""
-    first = np.arange(0, record.time_s.size, stride)
+    """Return one of ``stride`` samples; heat that holds between samples is averaged, so that none is lost.
+
+    The first of them where all channels were read, so that the step is even. Where channels report one after another, the sample
+    moves on from one to the next ``stride``, so that each has its turn.
+    """
     held = {name for name, channel in spec.channels.items() if channel.kind == "power" and channel.is_held}
+    read = np.array([np.isfinite(c) for name, c in record.values.items() if name not in held])
+    first = np.arange(0, record.time_s.size, stride)
+    whole = read[read.any(axis=1)][:, first].all(axis=0) if read.size else np.ones(first.size, dtype=bool)
+    first = np.minimum(first + np.where(whole, 0, np.arange(first.size) % stride), record.time_s.size - 1)
     values = {name: _means(c, first) if name in held else c[first] for name, c in record.values.items()}
     return replace(record, time_s=record.time_s[first], values=values)
 

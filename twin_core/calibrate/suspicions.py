@@ -193,7 +193,7 @@ def _changed(declared: Declared, columns: dict[str, Any]) -> Declared:
 
 
 def _recorded(declared: Declared, name: str) -> bool:
-    return all(name in record.values for record in declared.records)
+    return all(np.isfinite(record.values.get(name, np.array([np.nan]))).any() for record in declared.records)
 
 
 def _powers(declared: Declared) -> Iterator[Variant]:

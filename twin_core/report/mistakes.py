@@ -1,13 +1,20 @@
 """Mistakes of the declaration that would explain what a closed loop leaves unexplained, or how far its parameters went."""
 
+from itertools import combinations
+
 import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.identifiability import nothing_moves
+from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.summary import stated_guesses
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.discover.judge import Search
+from twin_core.errors import ModelError, TelemetryError
+
+MOST = 0.5
+"""Share of what a model leaves of two sensors, as a variance: more is most of it."""
 
 
 def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE) -> Json:
@@ -30,7 +37,12 @@ def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE
     still = nothing_moves(base.network.spec, [s.record for s in base.problem.segments])
     if still or not is_odd(parameters, guesses, misfit):
         return {"suspicions": []}
-    looked = suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline)
+    report = report | {"notices": [*contradictions(base), *report["notices"]]}
+    try:
+        looked = suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline)
+    except (TelemetryError, ModelError) as error:  # what was found stands without it
+        notice = f"mistakes of the declaration were not looked for: {error}"
+        return {"suspicions": [], "notices": [*report["notices"], notice]}
     better = [s for s in looked.found if s.misfit < misfit or not search.findings]
     complete = looked.complete and not search.findings
     told = report["words"]
@@ -41,3 +53,26 @@ def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE
         "words": [*report["words"], *(line for line in words if line not in first)],
         "notices": [*first, *report["notices"]],
     }
+
+
+def contradictions(calibration: Calibration) -> list[str]:
+    """Return in words which sensors of one node differ by most of what a model leaves of them: no heat can explain that.
+
+    One temperature is predicted for both, so that they leave half the square of their difference whatever the model does.
+    """
+    network, residual_K = calibration.network, np.concatenate(calibration.residuals)
+    sensors, said = network.spec.sensors, []
+    for a, b in combinations(range(len(sensors)), 2):
+        if network.layout.sensor_node(sensors[a]) != network.layout.sensor_node(sensors[b]):
+            continue
+        both = np.isfinite(residual_K[:, [a, b]]).all(axis=1)
+        if not both.any():
+            continue
+        apart_K2 = float(np.mean((residual_K[both, a] - residual_K[both, b]) ** 2))
+        left_K2 = float(np.mean((residual_K[both][:, [a, b]] ** 2).sum(axis=1)))
+        if 0.5 * apart_K2 > MOST * left_K2:
+            said.append(
+                f"'{sensors[a]}' and '{sensors[b]}' read one node, {network.layout.sensor_node(sensors[a])}, and differ by"
+                f" {np.sqrt(apart_K2):.3g} K (rms): no heat explains that; one of them is wrong, or they belong to two nodes"
+            )
+    return said

@@ -59,6 +59,22 @@ def test_thinning_loses_no_heat() -> None:
     np.testing.assert_array_equal(thin.time_s, time_s[::4])
 
 
+@pytest.mark.parametrize("stride", [2, 3, 4, 7])
+def test_channels_that_report_in_turn_are_all_kept(stride: int) -> None:
+    """Every other row, a thinned record of two rows apart had none of the second sensor's readings."""
+    time_s, heat = STEP_S * np.arange(1000), heat_W(1000, 1)
+    in_turn = np.where(np.arange(1000)[:, None] % 2 == [0, 1], exact_K(heat, time_s), np.nan)
+    record = record_of(time_s, Q=heat, T_a=in_turn[:, 0], T_b=in_turn[:, 1])
+    thin = thinned(load_spec(declared()), record, stride)
+    assert thin.time_s.size == -(-1000 // stride) and (np.diff(thin.time_s) > 0.0).all()
+    at = np.searchsorted(time_s, thin.time_s)
+    for name in ("T_a", "T_b"):
+        np.testing.assert_array_equal(thin.values[name], record.values[name][at])
+        assert np.isfinite(thin.values[name]).sum() == pytest.approx(500 / stride, rel=0.05)
+    for i, start in enumerate(at[:-1]):  # held heat is averaged up to the next sample
+        assert thin.values["Q"][i] == pytest.approx(heat[start : at[i + 1]].mean())
+
+
 def test_long_records_are_approached_on_thin_ones() -> None:
     problem, step_s = prepare(load_spec(declared()), [telemetry(5000)])
     coarse = coarse_problem(problem, step_s)
