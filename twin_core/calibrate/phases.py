@@ -119,7 +119,7 @@ def at_rest(
     known = {c: v for c, v in values.items() if c in spec.channels and np.isfinite(v)}
     lacking = sorted(set(spec.driving_channels) - known.keys())
     if lacking:
-        raise TelemetryError(f"{name}: '{lacking[0]}' is missing; a phase at rest needs every input and boundary")
+        raise TelemetryError(f"phase '{name}': '{lacking[0]}' is missing; a phase at rest needs every input and boundary")
     read = [sensor for sensor in spec.sensors if sensor in known]
     if not read:
         raise TelemetryError(f"{name}: no sensor was read (known: {', '.join(spec.sensors)})")
@@ -196,7 +196,7 @@ def correlate(
     names = [phase.name for phase in phases]
     twice = next((name for i, name in enumerate(names) if name in names[:i]), None)
     if twice is not None:
-        raise TelemetryError(f"{twice}: two phases have this name; each counts once")
+        raise TelemetryError(f"phase '{twice}': two phases have this name; each counts once")
     stated = _with_noise(spec, [phase.record for phase in phases if not phase.steady])
     records = [phase.record for phase in phases]
     unseen: tuple[str, ...] = ()

@@ -315,5 +315,8 @@ def build_problem(
     for column, sensor in enumerate(network.spec.sensors):
         if not any(segment.valid[:, column].any() for segment in segments):
             where = ", ".join(dict.fromkeys(r.name for r in records))
-            raise TelemetryError(f"{where}: channel '{sensor}' has no usable samples; drop the sensor from its node")
+            raise TelemetryError(
+                f"{where}: channel '{sensor}' has no usable samples in what is fitted; drop the sensor from its node, or fit a"
+                " part in which it was read"
+            )
     return Problem(network, segments, noise_K)
