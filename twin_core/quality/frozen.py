@@ -4,7 +4,8 @@ A reading stays the same where the truth stays within one quantisation step. How
 next is told by the readings just before and just after: by how far they move beyond what quantisation alone can show, and
 by how often they repeat themselves. A run of n repeats has the n-th power of that probability. The quieter side counts, so
 that a rest that something ends, or that something led to, is no freeze. Near a turning point of a smooth signal, a run of n
-repeats has neighbours that move by less than one step per sample, so no turning point is taken for a freeze.
+repeats has neighbours that move by less than one step per sample, so no turning point is taken for a freeze; nor does one end
+in a leap. Where the leap at the end of a run is more than all moves beside it, the truth went on unseen, as fast as both sides.
 """
 
 import math
@@ -13,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray, IntArray
-from twin_core.quality.policy import FALSE_ALARM_RATE, LEAST_READINGS
+from twin_core.quality.policy import FALSE_ALARM_RATE, LEAST_READINGS, LONGEST_SPIKE
 from twin_core.quality.quantisation import resolution
 from twin_core.quality.runs import runs_of
 
@@ -62,7 +63,7 @@ def frozen_channel(column: FloatArray) -> BoolArray:
     same = values[1:] == values[:-1]
     first, stop = runs_of(same)
     stay = np.maximum(same.mean(), _stay(values, first, stop))
-    doubtful = _unlikely(stop - first, np.full(first.size, same.mean()), 1)
+    doubtful = _unlikely(stop - first, np.full(first.size, same.mean()), 1) & (stay < 1.0)
     stay = np.maximum(stay, _sticky(values, first, stop, doubtful))
     of_present = np.zeros(at.size, dtype=np.bool_)
     _mark(of_present, first, stop, _unlikely(stop - first, stay, at.size))
@@ -71,30 +72,20 @@ def frozen_channel(column: FloatArray) -> BoolArray:
 
 
 def _sticky(values: FloatArray, first: IntArray, stop: IntArray, doubtful: BoolArray) -> FloatArray:
-    """Return how probable a repeat is as the other runs at the same value tell it, (n_runs,).
+    """Return how probable a repeat is as the channel's wide codes tell it, (n_runs,); 0 where it has none.
 
-    Some codes of a converter are far wider than others: what stays long at one value again and again is no freeze. The
-    longest of n runs has about log(n + 1) times the mean length, so it tells the probability, whatever the short ones do.
-    Only another run says so that, taken alone, is longer than the record's share of repeats explains. At the ends of the range it
-    may be a rail, which repeats too.
+    Some codes of a converter are far wider than others: what stays long at one value again and again is no freeze. Such a value
+    is known by two runs that, each taken alone, are longer than the record's share of repeats explains. One wide code tells of
+    others, that a short record shows once. The longest of n runs has about log(n + 1) times the mean length, so it tells the
+    probability, whatever the short ones do. At the ends of the range it may be a rail, which repeats too.
     """
-    length = (stop - first).astype(np.float64)
     _, code = np.unique(values[first], return_inverse=True)
-    order = np.lexsort((length, code))
-    last = np.flatnonzero(np.diff(code[order], append=-1))
-    has_two = np.concatenate([[False], code[order][1:] == code[order][:-1]])[last]
-    longest = length[order[last]]
-    second = np.where(has_two, length[order[np.maximum(last - 1, 0)]], 0.0)
-    others = np.bincount(code) - 1.0
-    is_longest = np.zeros(first.size, dtype=np.bool_)
-    is_longest[order[last]] = True
-    rival = np.where(is_longest, second[code], longest[code])
-    inner = (
-        (values[first] > values.min())
-        & (values[first] < values.max())
-        & (np.bincount(code, doubtful)[code] - doubtful > 0.0)
-    )
-    return np.where(inner, np.exp(-np.log(others[code] + 1.0) / np.maximum(rival, 1.0)), 0.0)
+    inner = (values[first] > values.min()) & (values[first] < values.max())
+    wide = inner & (np.bincount(code, doubtful)[code] > 1.0)
+    length = np.where(wide, stop - first, 0).astype(np.float64)
+    second, longest = np.sort(np.concatenate([[0.0, 0.0], length]))[-2:]
+    rival = np.where(length == longest, second, longest)
+    return np.where(inner & (rival > 0.0), np.exp(-np.log(wide.sum() - wide + 1.0) / np.maximum(rival, 1.0)), 0.0)
 
 
 def _unlikely(repeats: IntArray, stay: FloatArray, n_times: int) -> BoolArray:
@@ -118,16 +109,25 @@ def _stay(column: FloatArray, first: IntArray, stop: IntArray) -> FloatArray:
     squares = np.concatenate([[0.0], np.cumsum(beyond**2)])
     repeats = np.concatenate([[0], np.cumsum(changes == 0.0)])
     width = np.clip(stop - first, _LEAST_WINDOW, _LARGEST_WINDOW)
-    sides = []
     # The change that ends a freeze makes up for what was missed: it is no habit of the channel.
-    for low, high in ((first - 1 - width, first - 1), (stop + 1, stop + 1 + width)):
-        low, high = np.clip(low, 0, changes.size), np.clip(high, 0, changes.size)
-        count = high - low
-        spread = np.sqrt((squares[high] - squares[low]) / np.maximum(count, 1) / 2.0)
-        with np.errstate(divide="ignore"):
-            within = _erf(coarse / (2.0 * np.sqrt(2.0) * spread)).astype(np.float64)
-        share = (repeats[high] - repeats[low]) / np.maximum(count, 1)
-        sides.append(np.where(count >= _LEAST_WINDOW // 2, np.maximum(within, share), np.nan))
-    before, after = sides
+    low = np.clip([first - 1 - width, stop + 1], 0, changes.size)
+    high = np.clip([first - 1, stop + 1 + width], 0, changes.size)
+    count, moved = high - low, squares[high] - squares[low]
+    with np.errstate(divide="ignore"):
+        within = _erf(coarse / (2.0 * np.sqrt(2.0) * np.sqrt(moved / np.maximum(count, 1) / 2.0))).astype(np.float64)
+    share = (repeats[high] - repeats[low]) / np.maximum(count, 1)
+    enough = count >= _LEAST_WINDOW // 2
+    before, after = np.where(enough, np.maximum(within, share), np.nan)
     # A record may begin at rest. Where it ends frozen, what came before tells.
-    return np.where(np.isnan(before), 1.0, np.fmax(before, after))
+    at_rest = np.where(enough[0], np.fmax(before, after), 1.0)
+    # No turning point ends in one leap that outweighs all others beside it: the truth went on as fast as both sides tell.
+    leapt = (_leap(column, stop, coarse) ** 2 > moved.sum(axis=0)) & enough.all(axis=0)
+    return np.where(leapt, 1.0 - np.sqrt(np.prod(1.0 - share, axis=0)), at_rest)
+
+
+def _leap(column: FloatArray, stop: IntArray, coarse: float) -> FloatArray:
+    """Return how far each run ends in a leap that lasts longer than a spike, beyond one step, (n_runs,)."""
+    last = column.size - 1
+    lasting = np.minimum(*(np.abs(column[np.minimum(stop + n, last)] - column[stop]) for n in (1, 1 + LONGEST_SPIKE)))
+    leap: FloatArray = np.maximum(np.nan_to_num(lasting) - coarse, 0.0)
+    return leap

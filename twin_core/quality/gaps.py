@@ -116,7 +116,10 @@ def _known_parts(record: Record, driving: AbstractSet[str], needed: AbstractSet[
     first, stop = runs_of(~lacking)
     long = stop - first >= LEAST_PART
     cut = unknown if long.any() else []
-    notices = (*record.notices, *_lapse_notices(record, lapses, cut))
+    gone = np.full(lacking.size, bool(cut))
+    for begin, end in zip(first[long].tolist(), stop[long].tolist(), strict=True):
+        gone[begin:end] = False
+    notices = (*record.notices, *_lapse_notices(record, lapses, cut, gone))
     if not cut:
         return [replace(record, notices=notices)]
     bounds = np.unique([0, *first[long], *stop[long]])
@@ -150,21 +153,24 @@ def _lapses(record: Record, channel: str) -> Iterator[_Lapse]:
         yield _Lapse(channel, begin_s, end_s, lacking, end_s - begin_s < known_s)
 
 
-def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Lapse]) -> Iterator[str]:
-    """Yield one sentence for each channel and what is made of its lapses."""
-    told: dict[tuple[str, str], list[_Lapse]] = {}
+def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Lapse], gone: BoolArray) -> Iterator[str]:
+    """Yield one sentence for each channel and what is made of its lapses; of those bridged, where rows are not gone anyway."""
+    told: dict[tuple[str, str], list[tuple[_Lapse, int]]] = {}
     for lapse in lapses:
+        rows = int((lapse.lacking if lapse in cut else lapse.lacking & ~gone).sum())
+        if rows == 0:
+            continue
         if lapse in cut:
             fate = "changes faster than that: {} row(s) left out; a new segment begins with its next sample"
         elif lapse.known:
             fate = "changes more slowly than that: {} row(s) are given the values beside them"
         else:
             fate = "changes faster than that, yet {} row(s) are given the values beside them; add its samples, or leave them out"
-        told.setdefault((lapse.channel, fate), []).append(lapse)
+        told.setdefault((lapse.channel, fate), []).append((lapse, rows))
     for (channel, fate), same in told.items():
-        begin, end = record.present(same[0].begin_s), record.present(same[0].end_s)
+        begin, end = record.present(same[0][0].begin_s), record.present(same[0][0].end_s)
         again = f" (and {len(same) - 1} more such time(s))" if len(same) > 1 else ""
-        rows = int(sum(lapse.lacking.sum() for lapse in same))
+        rows = sum(count for _, count in same)
         yield f"{record.name}: channel '{channel}' has no samples from {begin} to {end}{again}, and {fate.format(rows)}"
 
 

@@ -89,6 +89,25 @@ def test_what_might_explain_heat_is_only_told() -> None:
     assert "channel 'charge' has no samples from 8940.0 to 12600.0" in notice and "59 row(s)" in notice
 
 
+@pytest.mark.parametrize(
+    ("charge", "rows"),
+    [
+        (between(150, 210), 0),  # gone with the heater's
+        (between(170, 200), 0),
+        (between(150, 230), 20),
+        (between(150, 210, between(300, 340)), 39),
+        (between(150, 210, between(205, 217)), 7),
+    ],
+)
+def test_rows_that_are_left_out_for_another_channel_are_not_told_to_be_bridged(charge: FloatArray, rows: int) -> None:
+    record = record_of(STEP_S * AT, Q=between(150, 210), charge=charge, T=290.0)
+    first, second = without_lapses([record], {"Q", "charge"}, {"Q"})
+    assert first.time_s.size + second.time_s.size == 341
+    told = [notice for notice in first.notices if "channel 'charge'" in notice]
+    assert [f"yet {rows} row(s)" in notice for notice in told] == ([True] if rows else [])
+    assert all("from 17940.0 to 20400.0, and" in notice for notice in told if rows == 39)  # the lapse that is left
+
+
 def heated() -> tuple[TwinSpec, Record]:
     """Return a node of 3000 J/K that loses 2 W/K to 280 K under a switched heater, and 400 minutes of it."""
     decay, temperature_K = np.exp(-2.0 * STEP_S / 3000.0), np.empty(400)

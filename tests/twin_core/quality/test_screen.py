@@ -200,6 +200,49 @@ def _measured(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray], dict[str, 
     return clock.to_numpy(dtype=float)[keep], columns, units
 
 
+def slow_swing() -> np.ndarray:
+    """Return a swing without noise that moves at most one step of 0.32 K per sample, (900,)."""
+    return 318.0 + 18.0 * np.sin(2.0 * np.pi * np.arange(900) / 400.0)
+
+
+@pytest.mark.parametrize(("begin", "lasting"), [(220, 100), (150, 60), (570, 80), (360, 41)])
+def test_a_freeze_between_single_steps_is_told_by_the_leap_that_ends_it(begin: int, lasting: int) -> None:
+    column = np.round(slow_swing() / 0.32) * 0.32
+    column[begin + 1 : begin + 1 + lasting] = column[begin]
+    masks = screen(np.arange(900.0), {"T_a": column}, {"T_a": "K"}).masks
+    assert set(masks["T_a"]) == {"frozen"}
+    frozen = masks["T_a"]["frozen"]
+    assert (
+        frozen[begin + 1 : begin + 1 + lasting].all() and frozen.sum() <= lasting + 4
+    )  # neighbours may share the code
+
+
+@pytest.mark.parametrize("what", ["offset after a rest", "spike after a rest", "gap after a turning point"])
+def test_a_leap_after_a_rest_is_no_freeze(what: str) -> None:
+    truth, time_s = slow_swing(), np.arange(900.0)
+    if what == "gap after a turning point":
+        keep = (time_s < 112) | (time_s > 200)  # the topmost step lasts from 88 to 112
+        truth, time_s = truth[keep], time_s[keep]
+    else:
+        truth[300:] = truth[300]
+        truth[400 : 900 if what.startswith("offset") else 402] += 8.0
+    masks = screen(time_s, {"T_a": np.round(truth / 0.32) * 0.32}, {"T_a": "K"}).masks
+    assert {reason for reasons in masks.values() for reason in reasons} <= {"spike"}
+
+
+def test_one_code_that_is_known_to_be_wide_tells_of_others() -> None:
+    """Of a converter every tenth code is as wide as eight: a cooling that passes 300 K once rests there too."""
+    rng = np.random.default_rng(2)
+    truth = np.concatenate([np.linspace(303.5, 294.0, 350), 295.0 + 3.0 * np.sin(np.arange(450) / 20.0)])
+    truth = truth + rng.normal(0.0, 0.3, 800)
+    nearest = np.round(truth / 2.5) * 2.5
+    column = np.where(np.abs(truth - nearest) < 1.0, nearest, np.round(truth / 0.25) * 0.25)
+    assert screen(np.arange(800.0), {"T_a": column}, {"T_a": "K"}).masks == {}
+    frozen = np.round(truth / 0.25) * 0.25  # the same of an even converter
+    frozen[121:181] = frozen[120]
+    assert screen(np.arange(800.0), {"T_a": frozen}, {"T_a": "K"}).masks["T_a"]["frozen"][121:181].all()
+
+
 MEASURED = sorted(DATA.glob("*/*.csv"))
 
 
@@ -216,3 +259,20 @@ def test_frozen_rows_of_the_measured_sets() -> None:
     funcube = {key: count for key, count in frozen.items() if key[0].startswith("whole_orbit")}
     assert len(funcube) == 14 and all(abs(count - 227) <= 2 for count in funcube.values())
     assert {key: count for key, count in frozen.items() if key not in funcube} == {("home_3", "T_indoor_degC"): 10}
+
+
+@pytest.mark.skipif(not MEASURED, reason="the measured sets are not beside the repository")
+def test_a_flight_whose_beginning_alone_is_given_loses_nothing() -> None:
+    """Twelve days rest at 27.93 degC and at 22.84 degC once each; 73 days do so again and again."""
+    time_s, columns, units = _measured(DATA / "chandra_psmc" / "flight_a.csv")
+    temperature = {name: column[:800] for name, column in columns.items() if units[name] == "degC"}
+    assert screen(time_s[:800], temperature, units).masks == {}
+
+
+@pytest.mark.skipif(not MEASURED, reason="the measured sets are not beside the repository")
+@pytest.mark.parametrize(("begin", "lasting"), [(200, 41), (200, 100), (250, 60), (500, 80), (600, 41)])
+def test_a_freeze_planted_in_the_temperature_lab_is_found(begin: int, lasting: int) -> None:
+    time_s, columns, units = _measured(DATA / "tclab_notre_dame" / "sine300s_run1.csv")
+    columns["T1_degC"][begin : begin + lasting] = columns["T1_degC"][begin]
+    masks = screen(time_s, columns, units).masks
+    assert set(masks) == {"T1_degC"} and masks["T1_degC"]["frozen"][begin + 1 : begin + lasting].all()
