@@ -119,7 +119,9 @@ def at_rest(
     known = {c: v for c, v in values.items() if c in spec.channels and np.isfinite(v)}
     lacking = sorted(set(spec.driving_channels) - known.keys())
     if lacking:
-        raise TelemetryError(f"phase '{name}': '{lacking[0]}' is missing; a phase at rest needs every input and boundary")
+        raise TelemetryError(
+            f"phase '{name}': '{lacking[0]}' is missing; a phase at rest needs every input and boundary"
+        )
     read = [sensor for sensor in spec.sensors if sensor in known]
     if not read:
         raise TelemetryError(f"{name}: no sensor was read (known: {', '.join(spec.sensors)})")
