@@ -10,7 +10,7 @@ from twin_core._typing import FloatArray
 from twin_core.network.model import Network
 from twin_core.network.spec import TwinSpec
 from twin_core.parameters.parameter import Parameter
-from twin_core.parameters.transforms import FROM_ZERO, Identity, LogInterval, is_logarithmic
+from twin_core.parameters.transforms import FROM_ZERO, Bounded, LogInterval, Shifted, is_logarithmic
 from twin_core.parameters.vector import ParameterSet
 from twin_core.telemetry import Record
 
@@ -21,7 +21,7 @@ LITTLE_LEARNED = 0.9
 """Nor is one whose uncertainty the data have reduced to no less than this share of its guess's."""
 
 IDENTIFIED_STD = 1.0 / 3.0
-"""A parameter whose relative standard deviation is below this is identified: signal-to-noise ratio of at least 3."""
+"""A parameter whose standard deviation is below this share of its size is identified: signal-to-noise ratio of at least 3."""
 
 NEAR = 1.5
 """A parameter within this factor of its guess is said to stay near it."""
@@ -39,6 +39,9 @@ OFF_LEVEL, MOST_OFF = 0.02, 0.1
 TOGETHER = 0.5
 """Parameters of a weak direction are told together where their estimates are correlated by more than this."""
 
+ANY_FACTOR = 20.0
+"""A weak direction whose ln is uncertain by this (a factor 5e8) or more is held by nothing: its width is no measured number."""
+
 
 def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     """Return names of free parameters that the data cannot see.
@@ -53,22 +56,38 @@ def unseen_parameters(parameters: ParameterSet, std: FloatArray) -> list[str]:
     Returns
     -------
     list of str
-        Positive parameters uncertain by more than a factor e, signed ones and temperatures by more than their own size, others
-        by one in the solver's coordinate: a whole share, or an onset by as much as lies between two looks for it.
+        Positive parameters uncertain by more than a factor e, others by more than their :func:`_size`, and any whose prior the
+        data have hardly narrowed down.
     """
     names = []
     for position, index in enumerate(parameters.free_index):
         parameter = parameters.parameters[index]
         prior = np.inf if parameter.prior_std is None else LITTLE_LEARNED * parameter.prior_std
-        own_size = isinstance(parameter.transform, Identity) or parameter.transform == FROM_ZERO
-        limit = abs(parameter.value) if own_size else min(UNSEEN_STD, prior)
-        if not std[position] < max(limit, 1e-12):
+        slope = parameter.transform.slope(parameter.free)
+        own = UNSEEN_STD if is_logarithmic(parameter.transform) else _size(parameter) / slope
+        if not std[position] < max(min(own, prior), 1e-12):
             names.append(parameter.name)
     return names
 
 
+def _size(parameter: Parameter) -> float:
+    """Return what the uncertainty of a parameter is measured by, in its own unit: its value, where its zero is nothing at all.
+
+    Kelvin and clocks have no such zero. A temperature is measured by the spread of its prior, a share or a place within an
+    interval by that or by its interval, and what the solver counts in steps, such as an onset between two looks for it, by one.
+    """
+    transform = parameter.transform
+    if isinstance(transform, Shifted):
+        return transform.scale
+    if isinstance(transform, Bounded) and transform.lower >= 0.0:
+        widest = min(parameter.prior_std or np.inf, transform.upper - transform.lower)
+        if np.isfinite(widest):
+            return widest
+    return abs(parameter.value)
+
+
 def identified(parameters: ParameterSet, std: FloatArray) -> dict[str, bool]:
-    """Return for each free parameter whether the data tell it to a third of its value or better.
+    """Return for each free parameter whether the data tell it to a third of its :func:`_size` or better.
 
     Parameters
     ----------
@@ -78,7 +97,7 @@ def identified(parameters: ParameterSet, std: FloatArray) -> dict[str, bool]:
         Posterior standard deviations in the solver's coordinate.
     """
     slopes = parameters.slopes(parameters.free)
-    sizes = np.abs(parameters.values[parameters.free_index])
+    sizes = np.array([_size(parameters.parameters[i]) for i in parameters.free_index], dtype=np.float64)
     told = std * slopes < IDENTIFIED_STD * np.maximum(sizes, 1e-300)
     return dict(zip(parameters.free_names, told.tolist(), strict=True))
 
@@ -100,8 +119,9 @@ def weakest_direction(parameters: ParameterSet, covariance: FloatArray) -> str |
     names = [parameters.free_names[logarithmic[k]] for k in heavy if correlation[k, heavy].max() > TOGETHER]
     if len(names) < 2:  # parameters that the data do not tell at all are said elsewhere, one by one
         return None
-    factor = float(np.exp(min(np.sqrt(spread[-1]), 20.0)))
-    return f"the data tell {' and '.join(names)} only together: they may move by a factor {factor:.3g} as one"
+    width = float(np.sqrt(spread[-1]))
+    factor = f"a factor {np.exp(width):.3g}" if width < ANY_FACTOR else "any factor"
+    return f"the data tell {' and '.join(names)} only together: they may move by {factor} as one"
 
 
 def words(

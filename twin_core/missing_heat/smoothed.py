@@ -84,6 +84,11 @@ class NodeHeat:
         return _rms(self.std_W)
 
     @property
+    def _varies(self) -> bool:
+        """Whether the missing heat is seen to vary: by more than its own uncertainty."""
+        return bool(self.mean_W.std() > self.band_W)
+
+    @property
     def correlation(self) -> float | None:
         """Correlation of the findings' heat with the missing heat; None where either is constant or there is none."""
         if self.effect_W is None or min(np.ptp(self.effect_W), np.ptp(self.mean_W)) <= 1e-9 * _rms(self.mean_W):
@@ -92,10 +97,15 @@ class NodeHeat:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether the findings' heat is the missing heat; None without one, or where the band is wider than it."""
+        """Whether the findings' heat is the missing heat; None without one, or where the band is wider than it.
+
+        Where the missing heat is seen to vary and the findings' does, they must repeat it too.
+        """
         if self.effect_W is None or _rms(self.effect_W) < BAND * self.band_W:
             return None
-        return self._is_alike or (self.correlation or 0.0) >= CORRELATED
+        if not self._varies or self.correlation is None:
+            return self._is_alike
+        return self.correlation >= (REPEATABLE**0.5 if self._is_alike else CORRELATED)
 
     @property
     def _is_alike(self) -> bool:
@@ -105,8 +115,13 @@ class NodeHeat:
         apart = _rms(self.effect_W - self.mean_W)
         return apart <= max(ALIKE * _rms(self.effect_W), BAND * self.band_W)
 
+    def _variation(self) -> str:
+        """Return in words how the heat varies and with what; heat that several things drive together follows none alone."""
+        if not self._varies:
+            return f"no variation beyond the uncertainty of {self.band_W:.2g} W is seen"
+        return f"this varies by {self.mean_W.std():.2g} W (uncertainty {self.band_W:.2g} W), and {self._following()}"
+
     def _following(self) -> str:
-        """Return in words what the swings follow; heat that several things drive together follows none of them alone."""
         what, share = next(iter(self.follows.items()), ("nothing", 0.0))
         if share < REPEATABLE:
             most = f" (at most {share:.0%} of it, the {what})" if share >= 0.01 else ""
@@ -126,20 +141,20 @@ class NodeHeat:
             else _rms(self.effect_W) / self.turnover_W,
             "correlation_with_effect": self.correlation,
             "agrees": self.agrees,
-            "follows": [{"what": what, "share": share} for what, share in self.follows.items()],
+            "follows": [{"what": what, "share": share} for what, share in self.follows.items() if self._varies],
         }
 
     def words(self, *, no_heat: bool = False) -> str:
         """Return what it says in a few sentences; ``no_heat``: what was found supplies none, such as a sensor that lags."""
-        mean, swing = self.mean_W.mean(), self.mean_W.std()
-        band = f"(uncertainty {self.band_W:.2g} W)"
+        mean = self.mean_W.mean()
         if no_heat:
+            varies = f" and vary by {self.mean_W.std():.2g} W" if self._varies else ""
             return (
-                f"Were what the readings at {self.node} show a heat, it would be {mean:.3g} W on average and vary by "
-                f"{swing:.2g} W {band}; what was found explains the readings without one."
+                f"Were what the readings at {self.node} show a heat, it would be {mean:.3g} W on average{varies} "
+                f"(uncertainty {self.band_W:.2g} W); what was found explains the readings without one."
             )
         lacks = f"lacks {mean:.3g} W at {self.node}" if mean >= 0.0 else f"has {-mean:.3g} W too much at {self.node}"
-        seen = f"The declared model {lacks} on average; this varies by {swing:.2g} W {band}, and {self._following()}."
+        seen = f"The declared model {lacks} on average; {self._variation()}."
         if self.effect_W is None:
             return seen
         supplied = self.effect_W.mean()
@@ -147,11 +162,13 @@ class NodeHeat:
             True: "the two agree"
             if self._is_alike
             else "the two rise and fall together, and declared parameters had taken up a part",
-            False: "the two differ, as they do where declared parameters had taken up a part of that heat",
+            False: "the two are alike in size but do not vary together"
+            if self._is_alike
+            else "the two differ, as they do where declared parameters had taken up a part of that heat",
             None: "the uncertainty is too wide to compare them",
         }[self.agrees]
         said = f"supply {supplied:.3g} W" if supplied >= 0.0 else f"take {-supplied:.3g} W away"
-        alike = "" if self.correlation is None else f" (correlation {self.correlation:.2f})"
+        alike = "" if self.correlation is None or not self._varies else f" (correlation {self.correlation:.2f})"
         return f"{seen} The findings {said} there: {verdict}{alike}."
 
 

@@ -16,7 +16,8 @@ from twin_core.calibrate.identifiability import (
 )
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
-from twin_core.parameters.parameter import absolute_temperature, positive, real
+from twin_core.parameters.parameter import Parameter, absolute_temperature, positive, real
+from twin_core.parameters.transforms import Bounded, Shifted, Transform
 from twin_core.parameters.vector import ParameterSet
 
 SET = ParameterSet(
@@ -133,9 +134,48 @@ def test_a_guess_near_its_bound_is_not_pulled_there() -> None:
     assert words(ParameterSet((near,)), np.array([[0.01]]), {"C:b": 198.0}) == []
 
 
-def test_a_sink_is_told_by_its_own_size() -> None:
-    sink = ParameterSet((absolute_temperature("T:sink", 250.0, prior_std_K=50.0),))
-    assert unseen_parameters(sink, np.array([40.0])) == [] and unseen_parameters(sink, np.array([300.0])) == ["T:sink"]
+@pytest.mark.parametrize("value_K", [0.0, 3.0, 250.0, 367.5])
+@pytest.mark.parametrize(
+    ("std_K", "told", "unseen"), [(5.0, True, False), (20.0, False, False), (46.0, False, True), (87.8, False, True)]
+)
+def test_a_temperature_is_told_where_its_prior_is_narrowed_down(
+    value_K: float, std_K: float, told: bool, unseen: bool
+) -> None:
+    """Of a prior of 50 K, a third is 17 K and nine tenths are 45 K, wherever on the scale the temperature lies."""
+    sink = ParameterSet((absolute_temperature("T:sink", value_K, prior_std_K=50.0),))
+    assert identified(sink, np.array([std_K])) == {"T:sink": told}
+    assert unseen_parameters(sink, np.array([std_K])) == ["T:sink"] * unseen
+
+
+@pytest.mark.parametrize(
+    ("transform", "value", "prior_std", "size"),
+    [
+        (Shifted(1.7e9, 600.0), 1.70001e9, 20.0, 1.0),  # an instant in Unix seconds, looked for every 600 s
+        (Shifted(0.0, 1.0), 293.0, 10.0, 1.0),  # a switching point
+        (Bounded(250.0, 320.0), 273.0, 20.0, 20.0),  # a melting point within what was visited
+        (Bounded(270.0, 280.0), 273.0, 20.0, 10.0),
+        (Bounded(0.0, 1.0), 0.0, None, 1.0),  # a share, which may be nothing
+        (Bounded(-250.0), -6.0, 50.0, 6.0),  # a bias, whose zero is no bias
+        (Bounded(-0.01, 0.02), 0.005, None, 0.005),  # a slope
+        (Bounded(0.0), 0.5, None, 0.5),  # a factor
+    ],
+)
+def test_what_has_no_natural_zero_is_measured_by_its_prior_or_interval(
+    transform: Transform, value: float, prior_std: float | None, size: float
+) -> None:
+    only = ParameterSet((Parameter("x", "", value, transform, prior_std),))
+    for share, told, unseen in ((0.3, True, False), (0.4, False, False), (1.01, False, True)):
+        assert identified(only, np.array([share * size])) == {"x": told}
+        assert unseen_parameters(only, np.array([share * size])) == ["x"] * unseen
+
+
+@pytest.mark.parametrize(("std", "said"), [(3.0, "by a factor 69.6 as one"), (25.0, "by any factor as one")])
+def test_a_direction_that_nothing_holds_has_no_factor(std: float, said: str) -> None:
+    """The sum of both logarithms has 3 standard deviations of one along its direction: e^(3 sqrt 2)."""
+    together = std**2 * np.array([[1.0, 1.0], [1.0, 1.0]]) + 1e-6 * np.eye(2)
+    both = ParameterSet((SET.parameters[0], SET.parameters[2]))
+    told = weakest_direction(both, together)
+    assert told is not None and told.endswith(said)
 
 
 @pytest.mark.parametrize(

@@ -134,7 +134,24 @@ def _heat(effect_W, mean_W, std_W=0.5) -> NodeHeat:
     ],
 )
 def test_what_a_heat_follows_is_told_as_far_as_it_was_looked_for(share, words):
-    assert replace(_heat(None, 4.0), follows={"channel Q": share}).words().endswith(words)
+    assert replace(_heat(None, 4.0 + WAVE), follows={"channel Q": share}).words().endswith(words)
+
+
+def test_of_a_variation_within_its_uncertainty_nothing_is_told():
+    """0.7 W beside 2 W, though all of it repeats with something, and with the findings' heat by chance."""
+    heat = replace(_heat(None, 5.0 + WAVE, 2.0), follows={"temperature of n": 1.0})
+    lines = (
+        heat.words(),
+        heat.words(no_heat=True),
+        replace(heat, effect_W=5.0 + 0.1 * WAVE).words(),
+        replace(heat, effect_W=5.0 - 0.1 * WAVE).words(),
+    )
+    for line in lines:
+        assert not any(word in line for word in ("vary by", "varies by", "temperature", "correlation"))
+        assert "uncertainty" in line and "2 W" in line
+    assert all("the two agree" in line for line in lines[2:])
+    assert heat.row()["follows"] == []
+    assert "varies by" in replace(heat, std_W=0.25 * heat.std_W).words()
 
 
 def test_nothing_is_said_of_a_node_that_lacks_nothing():
@@ -143,6 +160,7 @@ def test_nothing_is_said_of_a_node_that_lacks_nothing():
 
 
 WAVE = np.sin(np.arange(50.0) / 5.0)
+QUICK = np.where(np.arange(50) % 2, 1.0, -1.0)
 
 
 @pytest.mark.parametrize(
@@ -150,6 +168,9 @@ WAVE = np.sin(np.arange(50.0) / 5.0)
     [
         (5.0 + WAVE, 5.2 + WAVE, 0.5, True, "the two agree"),
         (5.0, 5.2 + WAVE, 0.5, True, "the two agree"),
+        (5.0 + 0.3 * WAVE, 5.2 + WAVE, 0.5, True, "the two agree"),
+        (5.0 - 0.3 * WAVE, 5.2 + WAVE, 0.5, False, "alike in size but do not vary together (correlation -1.00)"),
+        (5.0 + 0.3 * QUICK, 5.2 + WAVE, 0.5, False, "alike in size but do not vary together (correlation -0.0"),
         (5.0 + 3 * WAVE, 3 * WAVE, 0.5, True, "rise and fall together"),
         (5.0 + WAVE, -4.0 - WAVE, 0.5, False, "the two differ"),
         (0.3 * WAVE, -4.0 + 0.3 * WAVE, 2.0, None, "too wide"),
