@@ -46,8 +46,8 @@ N_BEFORE = 8
 """Names that are fitted at most from the simpler model as it was fitted, of each linear screening about it."""
 
 N_BESIDE_GRADIENTS = 6
-"""Names that are fitted at most of those that stand out beside gradients within the nodes, where the right one mostly comes
-first: heat that wanders at the nodes, or trajectories alone, would put it behind dozens of others."""
+"""Names that are fitted at most of those that stand out beside gradients within the nodes, where the right one often comes
+first: heat that wanders at the nodes, or trajectories alone, may put it behind dozens of others."""
 
 N_VARIED = 6
 """Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
@@ -157,7 +157,7 @@ def _bare(simple: Trial, found: Calibration) -> Calibration:
 
 def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place]) -> list[Effect]:
     """Return the names that stand out beside gradients within the nodes, about the simpler model fitted beside them."""
-    screened_there = screened_beside_gradients(simple, fallback=False)
+    screened_there = screened_beside_gradients(simple)
     if screened_there is None:
         return []
     about, screenings = screened_there

@@ -51,8 +51,8 @@ def screened(
     return screen_sizes(fit, shares, survey, effects)
 
 
-def screened_beside_gradients(trial: Trial, *, fallback: bool) -> tuple[HeatFit, list[Screening]] | None:
-    """Screen the candidates of a trial about its trajectories beside gradients within the nodes, and return where.
+def screened_beside_gradients(trial: Trial) -> tuple[HeatFit, list[Screening]] | None:
+    """Screen the named candidates of a trial about its trajectories beside gradients within the nodes, and return where.
 
     Once against a misfit that wanders at the sensors as what stays does, once against their noise alone. None where trajectories
     leave nothing that gradients could explain.
@@ -61,7 +61,7 @@ def screened_beside_gradients(trial: Trial, *, fallback: bool) -> tuple[HeatFit,
     if gradients is None:
         return None
     about = about_trajectory(gradients.problem, gradients.optimum)
-    survey, effects = candidates(trial, about, fallback=fallback)
+    survey, effects = candidates(trial, about, fallback=False)
     metrics = [partial(beside_gradients, gradients, is_white=is_white) for is_white in (False, True)]
     return about, screen_in(metrics, about, survey, effects)
 

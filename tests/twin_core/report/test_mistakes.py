@@ -20,22 +20,35 @@ def calibration(residual_K: np.ndarray, nodes: dict[str, str]) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("share", "nodes", "told"),
-    [(0.49, ("a", "a"), 0), (0.51, ("a", "a"), 1), (0.51, ("a", "b"), 0)],
-    ids=["less than half", "most of it", "of two nodes"],
+    ("difference_K", "share", "nodes", "told"),
+    [(40.0, 0.91, "aa", 1), (40.0, 0.89, "aa", 0), (40.0, 0.91, "ab", 0), (1.0, 0.91, "aa", 0)],
+    ids=["all but a little", "less", "of two nodes", "within some noises"],
 )
-def test_sensors_of_one_node_that_differ_by_most_of_the_misfit_are_told(
-    share: float, nodes: tuple[str, str], told: int
+def test_sensors_of_one_node_that_differ_by_all_that_is_left_are_told(
+    difference_K: float, share: float, nodes: str, told: int
 ) -> None:
-    """Half the square of a difference d stays of both, whatever one temperature is predicted; the rest is common to both."""
-    difference_K = 6.0
-    common_K = np.sqrt((1.0 / share - 1.0) * difference_K**2 / 4.0)
-    signs = np.where(np.arange(40) % 2, 1.0, -1.0)
-    residual = np.stack([common_K * signs + 3.0, common_K * signs - 3.0], axis=1)
+    """Half the difference each, and a swing of both: (a + b)² is the difference squared and four times the swing."""
+    common_K = np.sqrt((1.0 / share - 1.0) * difference_K**2 / 4.0) * np.where(np.arange(40) % 2, 1.0, -1.0)
+    residual = common_K[:, None] + difference_K * np.array([0.5, -0.5])
+    made = calibration(residual, {"T_1": nodes[0], "T_2": nodes[1]})
     residual[5, 0] = np.nan
-    words = contradictions(calibration(residual, {"T_1": nodes[0], "T_2": nodes[1]}))
+    # 39 samples are left: the swing's mean is no longer zero, but both have the same.
+    words = contradictions(made)
     assert len(words) == told
-    assert all("'T_1' and 'T_2' read one node, a, and differ by 6 K" in line for line in words)
+    assert all("'T_1' and 'T_2' read one node, a, and differ by 40 K" in line for line in words)
+
+
+def test_a_sensor_that_is_off_while_the_model_follows_the_other_is_told() -> None:
+    residual = np.random.default_rng(4).normal(size=(4000, 2)) * [0.05, 10.0]
+    made = calibration(residual, {"T_1": "a", "T_2": "a"})
+    made.problem.noise_K = np.array([0.001, 0.1])
+    (words,) = contradictions(made)
+    assert "differ by" in words
+
+
+def test_sensors_that_are_off_independently_contradict_nobody() -> None:
+    residual = 50.0 * np.random.default_rng(4).normal(size=(4000, 2))
+    assert contradictions(calibration(residual, {"T_1": "a", "T_2": "a"})) == []
 
 
 def test_sensors_that_are_never_read_together_contradict_nobody() -> None:
