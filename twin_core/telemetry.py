@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from twin_core._typing import FloatArray
+from twin_core._typing import BoolArray, FloatArray, IntArray
 from twin_core.errors import TelemetryError
 from twin_core.units import format_instant, parse_instant_ns
 
@@ -165,3 +165,13 @@ def _uninterrupted(record: Record, held: AbstractSet[str]) -> list[Record]:
     if record.time_s.size < 2:
         return [record]
     return record.parts(GAP_STEPS * float(np.median(np.diff(record.time_s))), held)
+
+
+def one_of_each(whole: BoolArray, stride: int) -> IntArray:
+    """Return one position of each ``stride`` samples, (n_samples / stride,): a record thinned so that no channel is lost.
+
+    The first of them where all channels that count were read, as ``whole`` (n_samples,) tells, so that the step is even. Where
+    channels report one after another, the position moves on from one to the next ``stride``, so that each has its turn.
+    """
+    first = np.arange(0, whole.size, stride)
+    return np.minimum(first + np.where(whole[first], 0, np.arange(first.size) % stride), whole.size - 1)

@@ -12,6 +12,7 @@ from service.store import samples
 from service.store.connection import Connection
 from service.store.samples import Samples
 from service.store.segments import WITHIN, within
+from twin_core.telemetry import one_of_each
 
 _EVER = 2**62
 How = Literal["all", "newest", "thinned"]
@@ -142,7 +143,7 @@ def _thinned(
     read = np.zeros(time_us.size, dtype=np.int64)
     for row in sensors:
         read += np.isfinite(samples.select(connection, twin, n_channels, [row], start, stop).values[0])
-    kept = _representatives(read, len(sensors), stride)
+    kept = one_of_each(read == len(sensors), stride)
     values = np.empty((n_channels, kept.size))
     for row in range(n_channels):
         column = samples.select(connection, twin, n_channels, [row], start, stop).values[0]
@@ -151,17 +152,6 @@ def _thinned(
             column = _held(column, before.get(row, np.nan))
         values[row] = _means(time_us, column, kept) if row in averaged else column[kept]
     return Samples(time_us[kept], values), stride
-
-
-def _representatives(read: NDArray[np.int64], n_sensors: int, stride: int) -> NDArray[np.int64]:
-    """Return one position of each ``stride`` samples: the first if all sensors were read there, so that the step is even.
-
-    Where sensors report one after another, the position moves on from block to block, so that each has its turn.
-    """
-    starts = np.arange(0, read.size, stride)
-    whole = read[starts] == n_sensors
-    turn = starts + np.where(whole, 0, np.arange(starts.size) % stride)
-    return np.asarray(np.minimum(turn, read.size - 1))
 
 
 def _held(column: NDArray[np.float64], before: float) -> NDArray[np.float64]:

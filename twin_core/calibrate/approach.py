@@ -14,7 +14,7 @@ from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Fit, Problem, build_problem
 from twin_core.network.spec import TwinSpec
-from twin_core.telemetry import Record
+from twin_core.telemetry import Record, one_of_each
 
 CAUTION = 3.0
 """The misfit is weighed as this many times itself: its samples are not independent of each other."""
@@ -121,16 +121,11 @@ def coarse_problem(problem: Problem, step_s: float, n_samples: int | None = None
 
 
 def thinned(spec: TwinSpec, record: Record, stride: int) -> Record:
-    """Return one of ``stride`` samples; heat that holds between samples is averaged, so that none is lost.
-
-    The first of them where all channels were read, so that the step is even. Where channels report one after another, the sample
-    moves on from one to the next ``stride``, so that each has its turn.
-    """
+    """Return one of ``stride`` samples, no channel lost; heat that holds between samples is averaged, so that none is missed."""
     held = {name for name, channel in spec.channels.items() if channel.kind == "power" and channel.is_held}
-    read = np.array([np.isfinite(c) for name, c in record.values.items() if name not in held])
-    first = np.arange(0, record.time_s.size, stride)
-    whole = read[read.any(axis=1)][:, first].all(axis=0) if read.size else np.ones(first.size, dtype=bool)
-    first = np.minimum(first + np.where(whole, 0, np.arange(first.size) % stride), record.time_s.size - 1)
+    read = [np.isfinite(column) for name, column in record.values.items() if name not in held]
+    whole = np.all([seen for seen in read if seen.any()] or np.ones((1, record.time_s.size)), axis=0)
+    first = one_of_each(whole, stride)
     values = {name: _means(c, first) if name in held else c[first] for name, c in record.values.items()}
     return replace(record, time_s=record.time_s[first], values=values)
 
