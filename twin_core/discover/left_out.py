@@ -42,9 +42,10 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     residual = np.concatenate(calibration.residuals) / problem.noise_K
     jacobian = jacobian / problem.noise_K[None, :, None]
     hessian = calibration.optimum.hessian
-    told = np.isinf(
-        problem.step_bounds(unknowns)[1]
-    )  # an instant is told by one block alone, and seldom moves linearly
+    down, up = problem.step_bounds(unknowns)
+    told = (down < 0.0) & (up > 0.0)  # what rests on a bound stays there
+    # An instant is told by one block alone, and seldom moves linearly.
+    told[: problem.n_free] &= np.isinf(problem.network.parameters.step_limits)
     jacobian, hessian = jacobian[:, :, told], hessian[np.ix_(told, told)]
     later = np.concatenate([~_opening(segment) for segment in problem.segments])
     edges = np.linspace(0, residual.shape[0], N_BLOCKS + 1).astype(int)

@@ -11,7 +11,7 @@ import numpy as np
 from twin_core._typing import FloatArray, IntArray
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.errors import ModelError
-from twin_core.network.quantities import Quantity, Tied, guess_or
+from twin_core.network.quantities import LEAST_MAGNITUDE, MOST_MAGNITUDE, Quantity, Tied, guess_or
 from twin_core.network.spec import Channel, Conductor, Heater, Load, Node, TwinSpec
 from twin_core.network.terms import (
     BoundaryConductor,
@@ -36,6 +36,7 @@ from twin_core.parameters.parameter import (
     positive,
     real,
 )
+from twin_core.parameters.transforms import Log
 from twin_core.parameters.vector import ParameterSet
 
 ARITHMETIC_S, ROOM_K = 1e-3, 293.0
@@ -200,6 +201,8 @@ def _quantity(name: str, unit: str, quantity: Quantity | None, default: float) -
     parameter = positive(
         name, unit, value, bounds=bounds, prior_std=prior, frozen=known, guessed=not (known or declared)
     )
+    if bounds is None:
+        parameter = replace(parameter, transform=Log(upper=MOST_MAGNITUDE, lower=LEAST_MAGNITUDE))
     if quantity is None or quantity.spread is None:
         return parameter
     log_slope = parameter.transform.slope(parameter.free) / value  # one where the solver's number is the logarithm

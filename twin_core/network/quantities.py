@@ -13,9 +13,14 @@ def _not_boolean(value: Any) -> Any:
     return value
 
 
+LEAST_MAGNITUDE = 1e-12
+MOST_MAGNITUDE = 1e15
+"""Between these a positive quantity in SI may lie, declared or calibrated; beyond them the balance cannot be computed."""
+
+
 def _zero_or_magnitude(value: float) -> float:
-    if value != 0.0 and not 1e-12 <= value <= 1e15:
-        raise ValueError("must be 0, or from 1e-12 to 1e15")
+    if value != 0.0 and not LEAST_MAGNITUDE <= value <= MOST_MAGNITUDE:
+        raise ValueError(f"must be 0, or from {LEAST_MAGNITUDE:g} to {MOST_MAGNITUDE:g}")
     return value
 
 
@@ -25,7 +30,7 @@ Magnitude = Annotated[
     float,
     BeforeValidator(_not_boolean),
     Field(gt=0, allow_inf_nan=False),
-    Field(ge=1e-12, le=1e15, allow_inf_nan=False),
+    Field(ge=LEAST_MAGNITUDE, le=MOST_MAGNITUDE, allow_inf_nan=False),
 ]
 """A positive quantity in SI that hardware may have; beyond it the balance cannot be computed."""
 MagnitudeOrNone = Annotated[

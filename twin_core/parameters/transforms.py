@@ -127,21 +127,26 @@ FROM_ZERO = Bounded(0.0)
 
 @dataclass(frozen=True)
 class Log:
-    """value = exp(free): a positive quantity of unknown order of magnitude, up to a bound if there is one."""
+    """value = exp(free): a positive quantity of unknown order of magnitude, within bounds that it may reach if there are any."""
 
     upper: float = np.inf
+    lower: float = 0.0
 
-    lowest: ClassVar[float] = -np.inf
     step_limit: ClassVar[float] = np.inf
 
     @property
+    def lowest(self) -> float:
+        """The logarithm of the lower bound."""
+        return float(np.log(self.lower)) if self.lower > 0.0 else -np.inf
+
+    @property
     def highest(self) -> float:
-        """The logarithm of the bound."""
+        """The logarithm of the upper bound."""
         return float(np.log(self.upper))
 
     def to_value(self, free: float) -> float:
-        """Return exp(free) up to the bound, held within e^-300 and e^300 so that a wild trial step stays a number."""
-        return min(float(np.exp(np.clip(free, -300.0, 300.0))), self.upper)
+        """Return exp(free) within the bounds, held within e^-300 and e^300 so that a wild trial step stays a number."""
+        return max(min(float(np.exp(np.clip(free, -300.0, 300.0))), self.upper), self.lower)
 
     def to_free(self, value: float) -> float:
         """Return ln(value)."""

@@ -13,6 +13,8 @@ from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.discover import left_out
 from twin_core.discover.left_out import N_BLOCKS, OPENING_SHARE, blocked_errors
 from twin_core.network.spec_io import load_spec
+from twin_core.parameters.transforms import Log
+from twin_core.parameters.vector import ParameterSet
 from twin_core.telemetry import Record
 
 STEP_S, N, ROOM_K, NOISE_K = 60.0, 320, 290.0, 0.05
@@ -83,6 +85,19 @@ def test_what_one_block_alone_tells_is_refitted(
     found, expected = blocked_errors(calibration), refitted(calibration)
     assert len(calls) == n_refits
     assert np.abs(found - expected).max() <= 0.03 * expected.sum()
+
+
+def test_a_bound_that_is_far_away_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    calibration = calibrated(held_but_once())
+    parameters = calibration.problem.network.parameters
+    bounded = ParameterSet(tuple(replace(p, transform=Log(upper=1e9)) for p in parameters.parameters))
+    unbounded = ParameterSet(tuple(replace(p, transform=Log()) for p in parameters.parameters))
+    monkeypatch.setattr(left_out, "MISJUDGED", np.inf)
+    errors = []
+    for some in (bounded, unbounded):
+        problem = calibration.problem.with_network(calibration.problem.network.with_parameters(some))
+        errors.append(blocked_errors(replace(calibration, problem=problem)))
+    np.testing.assert_array_equal(*errors)
 
 
 def test_a_refit_that_fails_leaves_the_linear_answer(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,11 @@ import pytest
 from tests.helpers import EVERY_TERM, EVERY_TERM_KNOTS, every_term_network
 from twin_core.effects import REGISTRY
 from twin_core.errors import ModelError
+from twin_core.network.calibrated import with_values
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.parameters.parameter import GUESS_LOG_STD, NO_GUESS_LOG_STD
+from twin_core.parameters.transforms import is_logarithmic
 
 
 def test_known_values_are_held_and_the_rest_is_free() -> None:
@@ -46,6 +48,20 @@ def test_defaults_start_only_what_nobody_guessed() -> None:
     network = build_network(load_spec(data), table_knots=EVERY_TERM_KNOTS, defaults={"G:a|b": 9.0, "C:a": 9.0})
     assert network.parameters.as_dict()["G:a|b"] == 9.0
     assert network.parameters.as_dict()["C:a"] == 8.0e3
+
+
+@pytest.mark.parametrize("free", [-90.0, 90.0])
+def test_whatever_is_calibrated_can_be_declared(free: float) -> None:
+    data = copy.deepcopy(EVERY_TERM)
+    del data["conductors"][0]["conductance_W_per_K"], data["nodes"][0]["capacity_J_per_K"]
+    spec = load_spec(data)
+    parameters = build_network(spec, table_knots=EVERY_TERM_KNOTS).parameters
+    positive = {p.name: p.transform.to_value(free) for p in parameters.parameters if is_logarithmic(p.transform)}
+    assert {"C:a", "G:a|b", "G:b|c", "gain:H|c"} <= positive.keys()
+    values = parameters.updated(positive).as_dict()
+    declared = load_spec(with_values(spec, values))
+    assert declared.nodes[0].capacity_J_per_K is not None
+    assert declared.nodes[0].capacity_J_per_K.value == values["C:a"]
 
 
 def test_sensors_read_their_nodes() -> None:

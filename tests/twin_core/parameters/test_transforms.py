@@ -52,6 +52,14 @@ def test_no_trial_step_leaves_the_admissible_values(free: float) -> None:
     assert INTERVAL.lower / rounding <= INTERVAL.to_value(free) <= INTERVAL.upper * rounding
 
 
+@given(free=st.floats(-1e6, 1e6))
+def test_a_positive_value_reaches_its_bounds_and_goes_no_further(free: float) -> None:
+    bounded = Log(upper=8.0, lower=0.5)
+    assert bounded.to_value(free) == pytest.approx(min(max(np.exp(np.clip(free, -9.0, 9.0)), 0.5), 8.0))
+    assert (bounded.to_value(bounded.lowest), bounded.to_value(bounded.highest)) == pytest.approx((0.5, 8.0))
+    assert (Log().lowest, Log().highest) == (-np.inf, np.inf)
+
+
 @pytest.mark.parametrize("value", [INTERVAL.lower, INTERVAL.upper])
 def test_a_guess_on_a_bound_can_still_move(value: float) -> None:
     free = INTERVAL.to_free(value)
