@@ -26,6 +26,7 @@ from twin_core.discover.shortlist import (
     screened_beside_gradients,
     shortlist,
 )
+from twin_core.discover.trajectories import starts_beside_gradients
 from twin_core.discover.trial import (
     Trial,
     about_trajectory,
@@ -82,7 +83,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     options = [
         *((effect, [bare]) for effect in near),
         *((effect, [fitted_before]) for effect in before),
-        *((effect, _starts_beside_gradients(simple)) for effect in beside),
+        *((effect, starts_beside_gradients(simple)) for effect in beside),
     ]
     fitted = state.attempt_each(
         [
@@ -168,14 +169,6 @@ def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place])
         for ranked in rankings
     ]
     return refined(about, shortlist(others, 0.0, N_BESIDE_GRADIENTS))
-
-
-def _starts_beside_gradients(simple: Trial) -> list[Calibration]:
-    """Return the simpler model fitted to trajectories, and beside gradients within the nodes."""
-    calibration, gradients = simple.calibration(), simple.beside_any_gradients()
-    if gradients is None:
-        return [calibration]
-    return [calibration, replace(calibration, problem=gradients.problem, optimum=gradients.optimum)]
 
 
 def _explaining(

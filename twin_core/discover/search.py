@@ -34,6 +34,7 @@ from twin_core.discover.trajectories import (
     LEAST_MISFIT_SHARE,
     SETTLING_NATS,
     TOGETHER_MISFIT_SHARE,
+    extend_beside_gradients,
     extend_by_trajectory,
 )
 from twin_core.discover.trial import Trial, converged, resettled, try_effects
@@ -117,6 +118,11 @@ def search(
             break  # what was found does not hold: the next step would find it again
     withdraw(state, needed)
     if not state.findings:
+        progress(0.85, "looking beside temperature gradients within the nodes")
+        with state.until(looking):
+            _look_beside_gradients(state, needed)
+        withdraw(state, needed)
+    if not state.findings:
         progress(0.9, "looking for a repeatable heat flow")
         with state.until(looking):
             _extend(state, needed, fallback=True)
@@ -131,6 +137,15 @@ def _converge(state: Search) -> None:
     """Take the fit of the model so far to its end, for it is what anything else is weighed against."""
     what = "a closer fit of " + ("what was found" if state.findings else "the declared model")
     state.trial = state.attempt(partial(converged, state.trial), what) or state.trial
+
+
+def _look_beside_gradients(state: Search, needed: float) -> None:
+    """Add an effect that shows beside gradients within the nodes alone, if one holds."""
+    what = "candidates beside gradients within the nodes"
+    if state.attempt(partial(extend_beside_gradients, state, needed), what):
+        complete(state, needed)
+        _converge(state)
+        prune(state, needed)
 
 
 def _places(state: Search) -> set[Place]:

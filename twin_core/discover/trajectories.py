@@ -5,13 +5,22 @@ that wanders at the sensors.
 """
 
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import partial
 from math import comb
 
+from twin_core.calibrate.second_order import Calibration
 from twin_core.discover.evidence import weigh
 from twin_core.discover.judge import Judged, Search, accept, once_each, worth
 from twin_core.discover.screen import Probe
-from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
+from twin_core.discover.shortlist import (
+    UNDECLARED_SHARES,
+    best_of_each_place,
+    refined,
+    screened,
+    screened_beside_gradients,
+    shortlist,
+)
 from twin_core.discover.trial import Trial, about_trajectory, resettled, try_on_trajectories
 from twin_core.effects.base import Effect, Place
 
@@ -86,6 +95,38 @@ def extend_by_trajectory(
     if min(options, key=worth).places == known:
         return False, []
     return accept(state, options, needed), [j.trial for j in sets]
+
+
+def extend_beside_gradients(state: Search, needed: float) -> bool:
+    """Add the effect that trajectories suggest beside gradients within the nodes; tell whether one holds.
+
+    Where parameters have made up for what is missing, nothing else answers where it belongs: neither about the measured
+    temperatures nor about the trajectories. Fitted beside gradients they need not make up for it.
+    """
+    screened_there = screened_beside_gradients(state.trial)
+    if screened_there is None:
+        return False
+    about, screenings = screened_there
+    rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
+    n_tried = state.count(max(state.n_named, *(len(ranked) for ranked in rankings)), fallback=False)
+    starts = starts_beside_gradients(state.trial)
+
+    def fitted(effect: Effect) -> Judged | None:
+        trial = try_on_trajectories(state.trial, (*state.trial.present_effects, effect), *starts)
+        return None if trial is None else _judged(state, trial, n_tried)
+
+    effects = refined(about, shortlist(rankings, needed, N_REFITS))
+    told = state.attempt_each([(partial(fitted, effect), f"{effect.label} beside gradients") for effect in effects])
+    best = once_each([j for j in told if j is not None])
+    return accept(state, [*_settled(state, best[:N_SETTLED], n_tried, needed), *best], needed)
+
+
+def starts_beside_gradients(trial: Trial) -> list[Calibration]:
+    """Return a trial's model fitted to trajectories, and beside gradients within the nodes."""
+    calibration, gradients = trial.calibration(), trial.beside_any_gradients()
+    if gradients is None:
+        return [calibration]
+    return [calibration, replace(calibration, problem=gradients.problem, optimum=gradients.optimum)]
 
 
 def _extensions(

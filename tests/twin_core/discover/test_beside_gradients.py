@@ -1,0 +1,88 @@
+"""The look beside gradients within the nodes: what it fits from where, and when it is asked at all."""
+
+from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from tests.twin_core.discover.stubs import NEEDED, judged, load, stub
+from twin_core.discover import search as searching
+from twin_core.discover import trajectories
+from twin_core.discover.evidence import Evidence
+from twin_core.discover.judge import Finding, Judged, Search
+from twin_core.discover.screen import Probe
+from twin_core.effects.base import Effect
+
+
+@pytest.fixture(autouse=True)
+def in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Search, "attempt_each", lambda state, works: [work() for work, _ in works])
+
+
+def test_what_stands_out_is_fitted_from_both_starts_and_the_likeliest_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    nats, asked, starts_seen = {"a": 60.0, "b": 90.0}, [], []
+    base: Any = stub(left=9.0)
+    base.present_effects, base.calibration = (), lambda: "along trajectories"
+
+    def tried(simple: Any, effects: tuple[Effect, ...], *starts: object) -> Any:
+        starts_seen.append(starts)
+        return None if effects[-1].where["node"] == "c" else stub(*effects)
+
+    def accepted(state: Search, options: Sequence[Judged], needed: float) -> bool:
+        asked.extend(options)
+        return True
+
+    names = [load(node) for node in "abc"]
+    for name, value in {
+        "screened_beside_gradients": lambda trial: (None, [SimpleNamespace(probes=[])]),
+        "best_of_each_place": lambda probes, n_samples: [Probe(effect, effect, 99.0) for effect in names],
+        "refined": lambda fit, effects: list(effects),
+        "starts_beside_gradients": lambda trial: ["along trajectories", "beside gradients"],
+        "try_on_trajectories": tried,
+        "weigh": lambda simple, rich, n_tried: Evidence(nats[str(rich.effects[-1].where["node"])], 0.0),
+        "_settled": lambda state, options, n_tried, needed: [],
+        "accept": accepted,
+    }.items():
+        monkeypatch.setattr(trajectories, name, value)
+    state = Search(base, base)
+    assert trajectories.extend_beside_gradients(state, NEEDED)
+    assert starts_seen == [("along trajectories", "beside gradients")] * 3
+    assert [j.effects[0].where["node"] for j in asked] == ["b", "a"]
+    assert state.n_named == 3
+
+
+def test_nothing_is_asked_where_gradients_have_nothing_to_explain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trajectories, "screened_beside_gradients", lambda trial: None)
+    assert not trajectories.extend_beside_gradients(Search(stub(), stub()), NEEDED)
+
+
+@pytest.mark.parametrize(
+    ("named", "beside", "looks"),
+    [(True, True, []), (False, True, ["beside"]), (False, False, ["beside", "without a name"])],
+    ids=["found at first", "found beside gradients", "found by neither"],
+)
+def test_gradients_are_asked_where_nothing_is_found_and_before_a_heat_without_a_name(
+    monkeypatch: pytest.MonkeyPatch, looks: list[str], *, named: bool, beside: bool
+) -> None:
+    asked: list[str] = []
+
+    def find(state: Search) -> bool:
+        state.findings.append(Finding(judged("a", 90.0)))
+        return True
+
+    def extend(state: Search, needed: float, *, fallback: bool) -> bool:
+        asked.extend(["without a name"] * fallback)
+        return named and not state.findings and find(state)
+
+    def look(state: Search, needed: float) -> bool:
+        asked.append("beside")
+        return beside and find(state)
+
+    for name in ("_converge", "complete", "prune", "withdraw", "reconsider", "tell_alternatives"):
+        monkeypatch.setattr(searching, name, lambda state, *needed: None)
+    monkeypatch.setattr(searching, "_extend", extend)
+    monkeypatch.setattr(searching, "extend_beside_gradients", look)
+    found = searching.search(stub(), false_alarm_rate=0.01)
+    assert asked == looks
+    assert bool(found.findings) == (named or beside)
