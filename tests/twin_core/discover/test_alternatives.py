@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from tests.twin_core.discover.stubs import CHANCE, JUST, NEEDED, judged, load, stub
-from twin_core.discover import alternatives
+from twin_core.discover import alternatives, trajectories
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Search
@@ -116,7 +116,7 @@ def test_what_stands_out_beside_gradients_is_fitted_from_both_of_their_optima(mo
     gradients = SimpleNamespace(problem="beside", optimum="gradients")
     fits.beside, fits.simple.beside_any_gradients = ["b"], lambda: gradients
     fits.rough["beside gradients"] = LEFT
-    monkeypatch.setattr(alternatives, "replace", lambda calibration, problem, optimum: f"{problem} {optimum}")
+    monkeypatch.setattr(trajectories, "replace", lambda calibration, problem, optimum: f"{problem} {optimum}")
     assert fits.told() == ["b"]
     fits.simple.beside_any_gradients = lambda: None
     assert fits.told() == []

@@ -173,6 +173,7 @@ def test_what_was_found_is_looked_over_when_the_time_for_looking_is_up(
 
     monkeypatch.setattr("twin_core.discover.search._extend", extend)
     monkeypatch.setattr("twin_core.discover.search.withdraw", withdraw)
+    monkeypatch.setattr("twin_core.discover.search.extend_beside_gradients", lambda state, needed: False)
     found = search(base, false_alarm_rate=0.01, deadline=100.0)
     assert extended[0] == extended[1] == pytest.approx(100.0 * (1.0 - REVISION_SHARE))
     assert found.left_out[0] == "looking" and asked[0] == "looked over"
