@@ -101,7 +101,8 @@ def extend_beside_gradients(state: Search, needed: float) -> bool:
     """Add the effect that trajectories suggest beside gradients within the nodes; tell whether one holds.
 
     Where parameters have made up for what is missing, nothing else answers where it belongs: neither about the measured
-    temperatures nor about the trajectories. Fitted beside gradients they need not make up for it.
+    temperatures nor about the trajectories. Fitted beside gradients they need not make up for it. What was refused for what it
+    predicts is not asked again.
     """
     screened_there = screened_beside_gradients(state.trial)
     if screened_there is None:
@@ -109,13 +110,15 @@ def extend_beside_gradients(state: Search, needed: float) -> bool:
     about, screenings = screened_there
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(state.n_named, *(len(ranked) for ranked in rankings)), fallback=False)
+    refused = {j.effects[0].place for j in state.rejected if len(j.effects) == 1 and j.validation is not None}
+    others = [[probe for probe in ranked if probe.effect.place not in refused] for ranked in rankings]
     starts = starts_beside_gradients(state.trial)
 
     def fitted(effect: Effect) -> Judged | None:
         trial = try_on_trajectories(state.trial, (*state.trial.present_effects, effect), *starts)
         return None if trial is None else _judged(state, trial, n_tried)
 
-    effects = refined(about, shortlist(rankings, needed, N_REFITS))
+    effects = refined(about, shortlist(others, needed, N_REFITS))
     told = state.attempt_each([(partial(fitted, effect), f"{effect.label} beside gradients") for effect in effects])
     best = once_each([j for j in told if j is not None])
     return accept(state, [*_settled(state, best[:N_SETTLED], n_tried, needed), *best], needed)

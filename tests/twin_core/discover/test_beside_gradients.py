@@ -1,6 +1,7 @@
 """The look beside gradients within the nodes: what it fits from where, and when it is asked at all."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ def in_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_what_stands_out_is_fitted_from_both_starts_and_the_likeliest_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One has no solution, one was refused for what it predicts; one that was less likely before is asked again."""
     nats, asked, starts_seen = {"a": 60.0, "b": 90.0}, [], []
     base: Any = stub(left=9.0)
     base.present_effects, base.calibration = (), lambda: "along trajectories"
@@ -33,7 +35,7 @@ def test_what_stands_out_is_fitted_from_both_starts_and_the_likeliest_first(monk
         asked.extend(options)
         return True
 
-    names = [load(node) for node in "abc"]
+    names = [load(node) for node in "abcd"]
     for name, value in {
         "screened_beside_gradients": lambda trial: (None, [SimpleNamespace(probes=[])]),
         "best_of_each_place": lambda probes, n_samples: [Probe(effect, effect, 99.0) for effect in names],
@@ -45,11 +47,11 @@ def test_what_stands_out_is_fitted_from_both_starts_and_the_likeliest_first(monk
         "accept": accepted,
     }.items():
         monkeypatch.setattr(trajectories, name, value)
-    state = Search(base, base)
+    state = Search(base, base, rejected=[judged("d", 99.0), replace(judged("b", 99.0), validation=None)])
     assert trajectories.extend_beside_gradients(state, NEEDED)
     assert starts_seen == [("along trajectories", "beside gradients")] * 3
     assert [j.effects[0].where["node"] for j in asked] == ["b", "a"]
-    assert state.n_named == 3
+    assert state.n_named == 4
 
 
 def test_nothing_is_asked_where_gradients_have_nothing_to_explain(monkeypatch: pytest.MonkeyPatch) -> None:
