@@ -23,6 +23,7 @@ from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4 as SIGMA
 from twin_core.errors import ModelError
 from twin_core.network.spec import TwinSpec
 from twin_core.parameters.parameter import Parameter
+from twin_core.parameters.transforms import LogInterval
 from twin_core.telemetry import Record
 
 LIMIT_K = 200.0
@@ -175,9 +176,9 @@ class Embedding:
 
 def _range(parameter: Parameter, inverse: bool) -> tuple[float, float]:
     """Return p_min and p_min + s_p of one parameter, of its inverse for a capacity."""
-    lower, upper = getattr(parameter.transform, "lower", None), getattr(parameter.transform, "upper", None)
-    if lower is None or upper is None:
+    if not isinstance(parameter.transform, LogInterval):
         return 0.0, SCALE_OF_GUESS * (1.0 / parameter.value if inverse else parameter.value)
+    lower, upper = parameter.transform.lower, parameter.transform.upper
     return (1.0 / upper, 1.0 / lower) if inverse else (lower, upper)
 
 
