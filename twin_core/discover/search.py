@@ -139,8 +139,18 @@ def _converge(state: Search) -> None:
     state.trial = state.attempt(partial(converged, state.trial), what) or state.trial
 
 
+def _nothing_is_missing(state: Search, needed: float) -> bool:
+    """Return whether trajectories fit, or no heat is missing that the odds asked for would support."""
+    if state.attempt(lambda: bool(state.trial.excess().max() < policy.LEAST_EXCESS), "how well trajectories fit"):
+        return True
+    missing = state.attempt(partial(gain_of_undeclared_heat, state.trial.fit), "how much heat is missing")
+    return missing is not None and missing <= needed
+
+
 def _look_beside_gradients(state: Search, needed: float) -> None:
-    """Add an effect that shows beside gradients within the nodes alone, if one holds."""
+    """Add an effect that shows beside gradients within the nodes alone, if one holds and anything is missing."""
+    if _nothing_is_missing(state, needed):
+        return
     what = "candidates beside gradients within the nodes"
     if state.attempt(partial(extend_beside_gradients, state, needed), what):
         complete(state, needed)
@@ -155,10 +165,7 @@ def _places(state: Search) -> set[Place]:
 
 def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     """Add the best supported effect, or pair of effects, to the state; False if none is supported or nothing is missing."""
-    if state.attempt(lambda: bool(state.trial.excess().max() < policy.LEAST_EXCESS), "how well trajectories fit"):
-        return False
-    missing = state.attempt(partial(gain_of_undeclared_heat, state.trial.fit), "how much heat is missing")
-    if missing is not None and missing <= needed:
+    if _nothing_is_missing(state, needed):
         return False
     state.attempt(state.trial.log_evidence, "the evidence for the model before")  # every fork would find it anew
     what = "effects without a name" if fallback else f"candidates for effect {len(state.findings) + 1}"

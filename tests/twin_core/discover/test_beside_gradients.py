@@ -7,12 +7,16 @@ from typing import Any
 
 import pytest
 
-from tests.twin_core.discover.stubs import NEEDED, judged, load, stub
+from benchmarks.network_cases import network_case
+from tests.twin_core.discover.stubs import JUST, NEEDED, judged, load, stub
+from twin_core.calibrate.second_order import fit_network
 from twin_core.discover import search as searching
 from twin_core.discover import trajectories
 from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Judged, Search
+from twin_core.discover.policy import LEAST_EXCESS
 from twin_core.discover.screen import Probe
+from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
 
 
@@ -85,6 +89,33 @@ def test_gradients_are_asked_where_nothing_is_found_and_before_a_heat_without_a_
         monkeypatch.setattr(searching, name, lambda state, *needed: None)
     monkeypatch.setattr(searching, "_extend", extend)
     monkeypatch.setattr(searching, "extend_beside_gradients", look)
+    monkeypatch.setattr(searching, "_nothing_is_missing", lambda state, needed: False)
     found = searching.search(stub(), false_alarm_rate=0.01)
     assert asked == looks
     assert bool(found.findings) == (named or beside)
+
+
+@pytest.mark.parametrize(
+    ("left", "missing", "is_asked"),
+    [(LEAST_EXCESS / 2.0 - JUST, 99.0, False), (LEAST_EXCESS / 2.0, NEEDED, False), (LEAST_EXCESS / 2.0, 99.0, True)],
+    ids=["trajectories fit", "no heat is missing", "something is missing"],
+)
+def test_a_healthy_record_is_not_looked_at_again(
+    monkeypatch: pytest.MonkeyPatch, left: float, missing: float, *, is_asked: bool
+) -> None:
+    asked: list[float] = []
+    base: Any = stub(left=left)
+    monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: missing)
+    monkeypatch.setattr(searching, "extend_beside_gradients", lambda state, needed: asked.append(needed))
+    searching._look_beside_gradients(Search(base, base), NEEDED)
+    assert bool(asked) == is_asked
+
+
+def test_what_the_other_looks_miss_is_named_from_the_readings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A spacecraft integrated by SciPy whose leak nobody declared."""
+    case = network_case("leak_to_boundary", 1, n_orbits=3, dt_s=300.0)
+    fit, calibration = fit_network(case.spec, [case.record])
+    monkeypatch.setattr(searching, "_extend", lambda state, needed, *, fallback: False)
+    base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+    (finding,) = searching.search(base, false_alarm_rate=0.01).findings
+    assert [(effect.name, dict(effect.where)) for effect in finding.effects] == [(case.effect, case.where)]
