@@ -132,6 +132,7 @@ def close_loop(
             progress=lambda f, m: progress(0.35 + 0.5 * f, m),
         )
         found.every = every
+        before = to_model(calibration, (), discrepancy=found.base.discrepancy())
         progress(0.88, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
         predictions = (declared, predicted)
@@ -198,7 +199,8 @@ def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[Ca
 def corrected(whole: Trial, found: Search) -> CalibratedModel:
     """Return the model with the findings on the whole record; what that leaves open lies in the middle of where it may be."""
     trial = on_all_samples(whole, found.trial)
-    return centred(to_model(trial.calibration(), trial.present_effects), trial.fit)
+    model = to_model(trial.calibration(), trial.present_effects, discrepancy=found.trial.discrepancy())
+    return centred(model, trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:

@@ -96,10 +96,11 @@ class WithGradients:
 
 @dataclass(frozen=True)
 class _Point:
-    """A point of the fit: unknowns, the model there, what it leaves beside its gradients, these, and the cost."""
+    """A point of the fit: unknowns, the model and its heat flows there, what stays beside its gradients, these, and the cost."""
 
     unknowns: FloatArray
     fit: Fit
+    flows_K: list[FloatArray]
     left_K: FloatArray
     biot: FloatArray
     cost: float
@@ -113,7 +114,7 @@ def with_gradients(
     Parameters
     ----------
     problem, optimum
-        A network fitted to open-loop trajectories; heat flows are those along its trajectories.
+        A network fitted to open-loop trajectories.
     near : (n_unknowns,)
         Where such a fit of a simpler network has ended: the better start counts.
     most_left
@@ -129,34 +130,38 @@ def with_gradients(
     ArithmeticError
         Where sensitivities are not finite.
     """
-    flows_K = heat_flows_K(problem, optimum)
+    flows_K = heat_flows_K(problem, optimum.unknowns, optimum.fit)
     of_sensor = [slice(a, b) for a, b in pairwise(np.cumsum([0, *(flows.shape[1] for flows in flows_K)]))]
     mean, std = problem.prior()
 
-    def at(unknowns: FloatArray, fit: Fit) -> _Point:
+    def at(unknowns: FloatArray, fit: Fit, flows_K: list[FloatArray]) -> _Point:
         left_K, biot = _beside_gradients(problem, fit, flows_K, of_sensor)
         against = float((((unknowns - mean) / std) ** 2).sum() + ((biot / BIOT) ** 2).sum())
-        return _Point(unknowns, fit, left_K, biot, 0.5 * (float(np.nansum((left_K / problem.noise_K) ** 2)) + against))
+        cost = 0.5 * (float(np.nansum((left_K / problem.noise_K) ** 2)) + against)
+        return _Point(unknowns, fit, flows_K, left_K, biot, cost)
 
-    here, damping = at(optimum.unknowns, optimum.fit), LEAST_DAMPING
+    here, damping = at(optimum.unknowns, optimum.fit, flows_K), LEAST_DAMPING
     if near is not None and np.isfinite((fit := problem.solve(near, near=optimum.fit)).cost):
-        here = min(here, at(near, fit), key=lambda point: point.cost)
-    enough = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum())
+        here = min(here, at(near, fit, heat_flows_K(problem, near, fit)), key=lambda point: point.cost)
+    enough, best = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum()), here
     for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
-        hessian, gradient = _equations(problem, optimum, here, flows_K, of_sensor)
+        hessian, gradient = _equations(problem, optimum, here, of_sensor)
         if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ _solved(hessian, gradient)) > enough:
             return None
         while damping < MOST_DAMPING:
             step = _solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
             fit = problem.solve(here.unknowns + step, near=here.fit)
-            there = at(here.unknowns + step, fit) if np.isfinite(fit.cost) else here
+            there = at(here.unknowns + step, fit, here.flows_K) if np.isfinite(fit.cost) else here
             if there.cost < here.cost:
-                here, damping = there, max(damping / 10.0, LEAST_DAMPING)
+                # A step takes the flows as they are. They follow, for where parameters make up for gradients they are wrong.
+                here = at(there.unknowns, there.fit, heat_flows_K(problem, there.unknowns, there.fit))
+                best, damping = min(best, here, key=lambda point: point.cost), max(damping / 10.0, LEAST_DAMPING)
                 break
             damping *= 10.0
-        if before - here.cost <= SETTLED_SHARE * before:
+        if abs(before - here.cost) <= SETTLED_SHARE * before:
             break
+    here = best
     ends = np.cumsum([segment.record.time_s.size for segment in problem.segments])[:-1]
     left_K = np.split(here.left_K, ends)
     of_mean = replace(
@@ -167,17 +172,18 @@ def with_gradients(
         ),
     )
     fit = replace(here.fit, cost=here.cost - 0.5 * float(((here.biot / BIOT) ** 2).sum()))
-    hessian, _ = _equations(problem, optimum, here, flows_K, of_sensor)
+    hessian, _ = _equations(problem, optimum, here, of_sensor)
     found = Optimum(here.unknowns, fit, hessian[: problem.n_unknowns, : problem.n_unknowns], "converged", 0)
     whitener = fit_whitener(of_mean, left_K)
     against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())
     against += 0.5 * (problem.n_unknowns - problem.n_free) * float(np.log(problem.n_samples))
-    log_posterior = whitener.log_likelihood - against - _averaged(whitener, flows_K)
-    return WithGradients(of_mean, found, whitener, tuple(here.biot[own] for own in of_sensor), log_posterior, flows_K)
+    log_posterior = whitener.log_likelihood - against - _averaged(whitener, here.flows_K)
+    biot = tuple(here.biot[own] for own in of_sensor)
+    return WithGradients(of_mean, found, whitener, biot, log_posterior, here.flows_K)
 
 
 def _equations(
-    problem: Problem, optimum: Optimum, here: _Point, flows_K: list[FloatArray], of_sensor: list[slice]
+    problem: Problem, optimum: Optimum, here: _Point, of_sensor: list[slice]
 ) -> tuple[FloatArray, FloatArray]:
     """Return Hessian (Gauss and Newton) and gradient of the cost over unknowns and all b_l."""
     mean, std = problem.prior()
@@ -186,7 +192,7 @@ def _equations(
     for sensor, jacobian in sensor_jacobians(problem, replace(optimum, unknowns=here.unknowns, fit=here.fit)):
         seen = np.isfinite(here.left_K[:, sensor])
         own = np.r_[0 : problem.n_unknowns, problem.n_unknowns + np.arange(here.biot.size)[of_sensor[sensor]]]
-        rows = np.hstack([jacobian, flows_K[sensor]])[seen] / problem.noise_K[sensor]
+        rows = np.hstack([jacobian, here.flows_K[sensor]])[seen] / problem.noise_K[sensor]
         hessian[np.ix_(own, own)] += rows.T @ rows
         gradient[own] -= rows.T @ (here.left_K[seen, sensor] / problem.noise_K[sensor])
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
@@ -230,16 +236,19 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         raise ArithmeticError("the readings do not tell the unknowns apart") from error
 
 
-def heat_flows_K(problem: Problem, optimum: Optimum) -> list[FloatArray]:
+def heat_flows_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> list[FloatArray]:
     """Return per sensor q_l / G of every heat flow into its node at the samples of all segments, (n_rows, n_flows) in K.
 
     Parameters
     ----------
-    problem, optimum
-        Heat flows are those along the trajectories of the optimum.
+    problem
+        With the network.
+    unknowns : (n_unknowns,)
+    fit
+        The model there: heat flows are those along its trajectories.
     """
-    network, values = problem.network, problem.values(optimum.unknowns)
-    paths = zip(problem.segments, optimum.fit.trajectories, strict=True)
+    network, values = problem.network, problem.values(unknowns)
+    paths = zip(problem.segments, fit.trajectories, strict=True)
     links = [_links(network, values, _points(network, values, segment, path)) for segment, path in paths]
     conductance = np.zeros(len(network.nodes))
     for link in (link for of_segment in links for link in of_segment):

@@ -32,11 +32,29 @@ NO_UNCERTAINTY = "the uncertainty of the parameters could not be computed"
 
 
 def to_model(
-    calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
+    calibration: Calibration,
+    effects: Sequence[Effect],
+    notices: Sequence[str] = (),
+    *,
+    uncertain: bool = True,
+    discrepancy: FloatArray | None = None,
 ) -> CalibratedModel:
-    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told.
+    """Return the calibrated model of a fit, with plain words.
 
-    Where it states one, its misfit is that which the fit was made from, else what the fit has left of it.
+    Parameters
+    ----------
+    calibration
+        The fit.
+    effects
+        At their fitted values.
+    notices
+        What was told on the way.
+    uncertain
+        Whether to state the covariance of the parameters. The misfit is then that which the fit was made from, else what the fit
+        has left of it.
+    discrepancy : (n_free, n_free)
+        Covariance of the free parameters that no noise tells of, because the network is not the whole truth, see
+        ``Trial.discrepancy``: added to theirs.
     """
     problem = calibration.problem
     network, spec = calibration.network, calibration.network.spec
@@ -44,7 +62,7 @@ def to_model(
     left = [no_longer(model, problem.span_s) for model in calibration.whitener.models]
     misfit = [(float(model.sigma_ou), float(model.length_s)) for model in left]
     if uncertain:
-        told = attempted(partial(_uncertainty, calibration), NO_UNCERTAINTY, failures)
+        told = attempted(partial(_uncertainty, calibration, discrepancy), NO_UNCERTAINTY, failures)
         if told is not None:
             free, noise = told
             misfit = [own.misfit or (0.0, length_s) for own, (_, length_s) in zip(noise, misfit, strict=True)]
@@ -64,11 +82,13 @@ def to_model(
     )
 
 
-def _uncertainty(calibration: Calibration) -> tuple[FloatArray, list[ExpectedNoise]]:
+def _uncertainty(calibration: Calibration, discrepancy: FloatArray | None) -> tuple[FloatArray, list[ExpectedNoise]]:
     """Return the covariance of the free parameters and the noise it comes from; ArithmeticError where it is not finite."""
     fit = calibration.problem, calibration.optimum, calibration.whitener
     noise = noise_of_fit(*fit)
     free = trajectory_covariance(*fit, noise)[: calibration.problem.n_free, : calibration.problem.n_free]
+    if discrepancy is not None:
+        free = free + discrepancy
     if not np.isfinite(free).all():
         raise ArithmeticError("it is not finite")
     return free, noise

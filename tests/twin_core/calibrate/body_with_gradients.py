@@ -31,26 +31,26 @@ def spec() -> dict[str, Any]:
     return data
 
 
-def off_the_mean_K(states_K: FloatArray, power_W: FloatArray) -> FloatArray:
-    """Return what the sensors read beside the mean of their node, (n_times, 2)."""
+def off_the_mean_K(states_K: FloatArray, power_W: FloatArray, off: FloatArray = OFF) -> FloatArray:
+    """Return what the sensors read beside the mean of their node, (n_times, 2), by the b_l of ``OFF``."""
     through, lost = G_W_PER_K * (states_K[:, 1] - states_K[:, 0]), LEAK_W_PER_K * (ROOM_K - states_K[:, 1])
-    first = (OFF[0] * through + OFF[1] * power_W) / G_W_PER_K
-    second = (OFF[2] * -through + OFF[3] * lost) / (G_W_PER_K + LEAK_W_PER_K)
+    first = (off[0] * through + off[1] * power_W) / G_W_PER_K
+    second = (off[2] * -through + off[3] * lost) / (G_W_PER_K + LEAK_W_PER_K)
     return np.stack([first, second], axis=1)
 
 
-def record(share: float, heat_W: float = 0.0) -> Record:
+def record(share: float, heat_W: float = 0.0, off: FloatArray = OFF, seed: int = 3) -> Record:
     """Return readings of which a share of the gradients is seen; the heat of a step is seen at its end.
 
-    ``heat_W`` is undeclared, sets no gradients up, and acts at n0.
+    ``heat_W`` is undeclared, sets no gradients up, and acts at n0; ``off`` as ``OFF``.
     """
-    rng = np.random.default_rng(3)
+    rng = np.random.default_rng(seed)
     time_s, power = 60.0 * np.arange(400), np.repeat(rng.choice([0.0, 40.0, 90.0], 40), 10)
     rates = -(laplacian(2, [(0, 1)], [G_W_PER_K]) + np.diag([0.0, LEAK_W_PER_K])) / CAPACITY_J_PER_K[:, None]
     drive = np.stack([power + heat_W, np.full(400, LEAK_W_PER_K * ROOM_K)], axis=1) / CAPACITY_J_PER_K
     states = linear_states(rates, drive, np.array([290.0, 288.0]), time_s)
     seen = np.concatenate([power[:1], power[:-1]])
-    read = states + share * off_the_mean_K(states, seen) + rng.normal(0.0, NOISE_K, (400, 2))
+    read = states + share * off_the_mean_K(states, seen, off) + rng.normal(0.0, NOISE_K, (400, 2))
     return record_of(time_s, Q=power, T0=read[:, 0], T1=read[:, 1])
 
 

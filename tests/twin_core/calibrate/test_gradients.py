@@ -59,7 +59,7 @@ def test_evidence_is_averaged_over_all_gradients() -> None:
     problem = calibration.problem
     found = with_gradients(problem, calibration.optimum)
     dense = formula = 0.0
-    for sensor, flows in enumerate(heat_flows_K(problem, calibration.optimum)):
+    for sensor, flows in enumerate(found.flows_K):
         noise, left = found.whitener.models[sensor], found.residuals[0][:, sensor]
         assert noise.sigma_ou == 0.0
         covariance = noise.sigma_white**2 * np.eye(left.size) + BIOT**2 * flows @ flows.T
@@ -83,7 +83,8 @@ def test_flows_are_those_of_the_heat_balance() -> None:
         time_s, Q=power_W, T0=hot_K + power_W / G_W_PER_K + noise[:, 0], T1=np.full(100, hot_K) + noise[:, 1]
     )
     calibration = fit_network(load_spec(data), [steady])[1]
-    first, second = heat_flows_K(calibration.problem, calibration.optimum)
+    optimum = calibration.optimum
+    first, second = heat_flows_K(calibration.problem, optimum.unknowns, optimum.fit)
     assert first[-1] * G_W_PER_K == pytest.approx([-power_W, power_W], rel=1e-3)
     assert second[-1] * (G_W_PER_K + LEAK_W_PER_K) == pytest.approx([power_W, -power_W], rel=1e-3)
 
@@ -115,8 +116,8 @@ def test_a_sensor_that_lags_reads_its_gradients_late() -> None:
     begun_K = unknowns[without.start_columns(0)]
     start = problem.start()
     start[problem.start_columns(0)] = [*begun_K, begun_K[0]]
-    with_lag = heat_flows_K(problem, replace(plain.optimum, unknowns=start, fit=problem.solve(start)))
-    now = heat_flows_K(without, plain.optimum)
+    with_lag = heat_flows_K(problem, start, problem.solve(start))
+    now = heat_flows_K(without, unknowns, plain.optimum.fit)
     states = StateSpace(-1.0 / tau_s, 1.0 / tau_s, 1.0, 0.0)
     time_s = step_s * np.arange(400)
     for late, flow in zip(with_lag[0].T, now[0].T, strict=False):
