@@ -54,7 +54,8 @@ def to_model(
         has left of it.
     discrepancy : (n_free, n_free)
         Covariance of the free parameters that no noise tells of, because the network is not the whole truth, see
-        ``Trial.discrepancy``: added to theirs.
+        ``Trial.discrepancy``: it is part of the stated deviations. The model's covariance is without it, for a forecast counts
+        the misfit, which is what the network lacks.
     """
     problem = calibration.problem
     network, spec = calibration.network, calibration.network.spec
@@ -62,7 +63,7 @@ def to_model(
     left = [no_longer(model, problem.span_s) for model in calibration.whitener.models]
     misfit = [(float(model.sigma_ou), float(model.length_s)) for model in left]
     if uncertain:
-        told = attempted(partial(_uncertainty, calibration, discrepancy), NO_UNCERTAINTY, failures)
+        told = attempted(partial(_uncertainty, calibration), NO_UNCERTAINTY, failures)
         if told is not None:
             free, noise = told
             misfit = [own.misfit or (0.0, length_s) for own, (_, length_s) in zip(noise, misfit, strict=True)]
@@ -78,17 +79,15 @@ def to_model(
         {s: length_s for s, (_, length_s) in zip(spec.sensors, misfit, strict=True)},
         calibration.max_step_s,
         dict(network.layout.table_knots),
-        _summary(calibration, effects, free, [*notices, *failures]),
+        _summary(calibration, effects, free, discrepancy, [*notices, *failures]),
     )
 
 
-def _uncertainty(calibration: Calibration, discrepancy: FloatArray | None) -> tuple[FloatArray, list[ExpectedNoise]]:
+def _uncertainty(calibration: Calibration) -> tuple[FloatArray, list[ExpectedNoise]]:
     """Return the covariance of the free parameters and the noise it comes from; ArithmeticError where it is not finite."""
     fit = calibration.problem, calibration.optimum, calibration.whitener
     noise = noise_of_fit(*fit)
     free = trajectory_covariance(*fit, noise)[: calibration.problem.n_free, : calibration.problem.n_free]
-    if discrepancy is not None:
-        free = free + discrepancy
     if not np.isfinite(free).all():
         raise ArithmeticError("it is not finite")
     return free, noise
@@ -111,7 +110,11 @@ def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray 
 
 
 def _summary(
-    calibration: Calibration, effects: Sequence[Effect], covariance: FloatArray | None, notices: Sequence[str]
+    calibration: Calibration,
+    effects: Sequence[Effect],
+    covariance: FloatArray | None,
+    discrepancy: FloatArray | None,
+    notices: Sequence[str],
 ) -> Json:
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
@@ -121,7 +124,8 @@ def _summary(
     told: dict[str, bool] = {}
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
-        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        variance = np.diag(covariance) + (0.0 if discrepancy is None else np.diag(discrepancy))
+        stds = np.sqrt(np.maximum(variance, 0.0))
         stds[untold] = np.inf
         for name in (f"{e.label}.{q.name}" for e in effects for q in e.parameter_specs() if q.open_ended):
             position = network.parameters.free_names.index(name)
