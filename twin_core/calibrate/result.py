@@ -34,8 +34,8 @@ class CalibratedModel:
     values
         Parameter name -> physical value, effects included.
     covariance : (n_free, n_free)
-        Of the free parameters in the solver's coordinate (ln for positive ones), in the order of ``free_names``, if the network is
-        the whole truth; the deviations of ``summary`` hold how far it is not, where that is known.
+        Of the free parameters in the solver's coordinate (ln for positive ones), in the order of ``free_names``, if the network
+        is the whole truth; the deviations of ``summary`` hold how far it is not, where that is known.
     free_names
         Names of the calibrated parameters; none, and no covariance, where the method states no uncertainty.
     noise_K
