@@ -9,7 +9,8 @@ from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.compiled import deadline_after
-from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.containment import TimeIsUpError, attempted, limited
+from twin_core.calibrate.discrepancy import stated
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
@@ -132,9 +133,11 @@ def close_loop(
             progress=lambda f, m: progress(0.35 + 0.5 * f, m),
         )
         found.every = every
-        before = to_model(calibration, (), discrepancy=found.base.discrepancy())
         progress(0.88, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
+        is_corrected = after is not before
+        before = _stated(before, found, found.base, latest)
+        after = _stated(after, found, found.trial, latest) if is_corrected else before
         predictions = (declared, predicted)
         report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
         progress(0.93, "drawing")
@@ -196,11 +199,22 @@ def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[Ca
     return after
 
 
+def _stated(model: CalibratedModel, found: Search, trial: Trial, deadline: float) -> CalibratedModel:
+    """Return a model whose deviations hold what a coarse network makes its parameters wrong by; told where they do not."""
+    what = "what a coarse network makes parameters wrong by"
+    try:
+        with limited(deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            told = attempted(trial.discrepancy, what, found.failures)
+    except (ModelError, TimeIsUpError) as error:
+        found.failures.append(f"{what}: {error}")
+        told = None
+    return model if told is None else stated(model, told)
+
+
 def corrected(whole: Trial, found: Search) -> CalibratedModel:
     """Return the model with the findings on the whole record; what that leaves open lies in the middle of where it may be."""
     trial = on_all_samples(whole, found.trial)
-    model = to_model(trial.calibration(), trial.present_effects, discrepancy=found.trial.discrepancy())
-    return centred(model, trial.fit)
+    return centred(to_model(trial.calibration(), trial.present_effects), trial.fit)
 
 
 def centred(model: CalibratedModel, fit: HeatFit) -> CalibratedModel:

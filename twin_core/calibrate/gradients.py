@@ -111,6 +111,9 @@ def with_gradients(
 ) -> WithGradients | None:
     """Fit gradients within the nodes beside all unknowns, from an open-loop optimum.
 
+    A step takes the heat flows as they are; at each point they are its own, for where parameters make up for gradients the
+    flows of the plain fit are wrong. G is that of the plain fit: otherwise gradients would grow with falling conductances.
+
     Parameters
     ----------
     problem, optimum
@@ -128,22 +131,28 @@ def with_gradients(
     Raises
     ------
     ArithmeticError
-        Where sensitivities are not finite.
+        Where sensitivities or heat flows are not finite.
     """
-    flows_K = heat_flows_K(problem, optimum.unknowns, optimum.fit)
+    conductance = conductances_W_per_K(problem, optimum.unknowns, optimum.fit)
+    flows_K = heat_flows_K(problem, optimum.unknowns, optimum.fit, conductance)
     of_sensor = [slice(a, b) for a, b in pairwise(np.cumsum([0, *(flows.shape[1] for flows in flows_K)]))]
     mean, std = problem.prior()
 
-    def at(unknowns: FloatArray, fit: Fit, flows_K: list[FloatArray]) -> _Point:
+    def at(unknowns: FloatArray, fit: Fit) -> _Point:
+        flows_K = heat_flows_K(problem, unknowns, fit, conductance)
+        if not all(np.isfinite(flows).all() for flows in flows_K):
+            return _Point(unknowns, fit, flows_K, np.zeros((0, 0)), np.zeros(0), np.inf)
         left_K, biot = _beside_gradients(problem, fit, flows_K, of_sensor)
         against = float((((unknowns - mean) / std) ** 2).sum() + ((biot / BIOT) ** 2).sum())
         cost = 0.5 * (float(np.nansum((left_K / problem.noise_K) ** 2)) + against)
         return _Point(unknowns, fit, flows_K, left_K, biot, cost)
 
-    here, damping = at(optimum.unknowns, optimum.fit, flows_K), LEAST_DAMPING
+    here, damping = at(optimum.unknowns, optimum.fit), LEAST_DAMPING
+    if not np.isfinite(here.cost):
+        raise ArithmeticError("the heat flows are not finite")
     if near is not None and np.isfinite((fit := problem.solve(near, near=optimum.fit)).cost):
-        here = min(here, at(near, fit, heat_flows_K(problem, near, fit)), key=lambda point: point.cost)
-    enough, best = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum()), here
+        here = min(here, at(near, fit), key=lambda point: point.cost)
+    enough = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum())
     for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here, of_sensor)
@@ -152,16 +161,13 @@ def with_gradients(
         while damping < MOST_DAMPING:
             step = _solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
             fit = problem.solve(here.unknowns + step, near=here.fit)
-            there = at(here.unknowns + step, fit, here.flows_K) if np.isfinite(fit.cost) else here
+            there = at(here.unknowns + step, fit) if np.isfinite(fit.cost) else here
             if there.cost < here.cost:
-                # A step takes the flows as they are. They follow, for where parameters make up for gradients they are wrong.
-                here = at(there.unknowns, there.fit, heat_flows_K(problem, there.unknowns, there.fit))
-                best, damping = min(best, here, key=lambda point: point.cost), max(damping / 10.0, LEAST_DAMPING)
+                here, damping = there, max(damping / 10.0, LEAST_DAMPING)
                 break
             damping *= 10.0
-        if abs(before - here.cost) <= SETTLED_SHARE * before:
+        if before - here.cost <= SETTLED_SHARE * before:
             break
-    here = best
     ends = np.cumsum([segment.record.time_s.size for segment in problem.segments])[:-1]
     left_K = np.split(here.left_K, ends)
     of_mean = replace(
@@ -236,7 +242,26 @@ def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
         raise ArithmeticError("the readings do not tell the unknowns apart") from error
 
 
-def heat_flows_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> list[FloatArray]:
+def conductances_W_per_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> FloatArray:
+    """Return by how much the heat into each node falls with its temperature, mean over all segments, (n_nodes,)."""
+    return _conductances_W_per_K(problem.network, _all_links(problem, unknowns, fit))
+
+
+def _conductances_W_per_K(network: Network, links: list[list["_Link"]]) -> FloatArray:
+    found = np.zeros(len(network.nodes))
+    for link in (link for of_segment in links for link in of_segment):
+        found[link.node] += link.conductance_W_per_K / len(links)
+    return found
+
+
+def _all_links(problem: Problem, unknowns: FloatArray, fit: Fit) -> list[list["_Link"]]:
+    """Return every heat flow into a node along the trajectories, per segment."""
+    network, values = problem.network, problem.values(unknowns)
+    paths = zip(problem.segments, fit.trajectories, strict=True)
+    return [_links(network, values, _points(network, values, segment, path)) for segment, path in paths]
+
+
+def heat_flows_K(problem: Problem, unknowns: FloatArray, fit: Fit, conductance: FloatArray) -> list[FloatArray]:
     """Return per sensor q_l / G of every heat flow into its node at the samples of all segments, (n_rows, n_flows) in K.
 
     Parameters
@@ -246,22 +271,20 @@ def heat_flows_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> list[Float
     unknowns : (n_unknowns,)
     fit
         The model there: heat flows are those along its trajectories.
+    conductance : (n_nodes,)
+        G in W/K.
     """
     network, values = problem.network, problem.values(unknowns)
-    paths = zip(problem.segments, fit.trajectories, strict=True)
-    links = [_links(network, values, _points(network, values, segment, path)) for segment, path in paths]
-    conductance = np.zeros(len(network.nodes))
-    for link in (link for of_segment in links for link in of_segment):
-        conductance[link.node] += link.conductance_W_per_K / len(links)
-    found = []
+    links = _all_links(problem, unknowns, fit)
+    own_W_per_K, found = _conductances_W_per_K(network, links), []
     for sensor, state in zip(network.spec.sensors, network.sensor_node.tolist(), strict=True):
         node = network.layout.node(network.layout.sensor_node(sensor))
         own = [k for k, link in enumerate(links[0]) if link.node == node and conductance[node] > 0.0]
         parts = []
         for of_segment, s in zip(links, problem.segments, strict=True):
             columns = [of_segment[k].heat_W[_at_samples(s)] / conductance[node] for k in own]
-            if state != node and conductance[state] > 0.0:  # a sensor that lags behind what it is attached to
-                tau_s = float(values[network.capacity_index[state]] / conductance[state])
+            if state != node and own_W_per_K[state] > 0.0:  # a sensor that lags behind what it is attached to
+                tau_s = float(values[network.capacity_index[state]] / own_W_per_K[state])
                 columns = [first_order_lag(s.record.time_s, column, tau_s) for column in columns]
             parts.append(np.stack(columns, axis=1) if columns else np.zeros((s.record.time_s.size, 0)))
         found.append(np.concatenate(parts))

@@ -32,30 +32,11 @@ NO_UNCERTAINTY = "the uncertainty of the parameters could not be computed"
 
 
 def to_model(
-    calibration: Calibration,
-    effects: Sequence[Effect],
-    notices: Sequence[str] = (),
-    *,
-    uncertain: bool = True,
-    discrepancy: FloatArray | None = None,
+    calibration: Calibration, effects: Sequence[Effect], notices: Sequence[str] = (), *, uncertain: bool = True
 ) -> CalibratedModel:
-    """Return the calibrated model of a fit, with plain words.
+    """Return the calibrated model of a fit, with plain words, and with the covariance of its parameters unless told.
 
-    Parameters
-    ----------
-    calibration
-        The fit.
-    effects
-        At their fitted values.
-    notices
-        What was told on the way.
-    uncertain
-        Whether to state the covariance of the parameters. The misfit is then that which the fit was made from, else what the fit
-        has left of it.
-    discrepancy : (n_free, n_free)
-        Covariance of the free parameters that no noise tells of, because the network is not the whole truth, see
-        ``Trial.discrepancy``: it is part of the stated deviations. The model's covariance is without it, for a forecast counts
-        the misfit, which is what the network lacks.
+    Where it states one, its misfit is that which the fit was made from, else what the fit has left of it.
     """
     problem = calibration.problem
     network, spec = calibration.network, calibration.network.spec
@@ -79,7 +60,7 @@ def to_model(
         {s: length_s for s, (_, length_s) in zip(spec.sensors, misfit, strict=True)},
         calibration.max_step_s,
         dict(network.layout.table_knots),
-        _summary(calibration, effects, free, discrepancy, [*notices, *failures]),
+        _summary(calibration, effects, free, [*notices, *failures]),
     )
 
 
@@ -110,11 +91,7 @@ def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray 
 
 
 def _summary(
-    calibration: Calibration,
-    effects: Sequence[Effect],
-    covariance: FloatArray | None,
-    discrepancy: FloatArray | None,
-    notices: Sequence[str],
+    calibration: Calibration, effects: Sequence[Effect], covariance: FloatArray | None, notices: Sequence[str]
 ) -> Json:
     """Return the plain figures of a fit for people and JSON."""
     problem, optimum, network = calibration.problem, calibration.optimum, calibration.network
@@ -124,8 +101,7 @@ def _summary(
     told: dict[str, bool] = {}
     if covariance is not None:
         slopes = network.parameters.slopes(network.parameters.free)
-        variance = np.diag(covariance) + (0.0 if discrepancy is None else np.diag(discrepancy))
-        stds = np.sqrt(np.maximum(variance, 0.0))
+        stds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         stds[untold] = np.inf
         for name in (f"{e.label}.{q.name}" for e in effects for q in e.parameter_specs() if q.open_ended):
             position = network.parameters.free_names.index(name)

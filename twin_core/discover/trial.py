@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy.special import expit
 
 from twin_core._typing import FloatArray, IntArray
 from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.discrepancy import Discrepancy, discrepancy
 from twin_core.calibrate.gradients import WithGradients, with_gradients
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Problem
@@ -129,24 +129,19 @@ class Trial:
             near = carried_over(below.problem, below.optimum.unknowns, problem, own)
         return attempted(partial(with_gradients, problem, optimum, near, most_left), "gradients within nodes", [])
 
-    @once
-    def discrepancy(self) -> FloatArray:
-        """Covariance of the free parameters because a lumped network is coarse, (n_free, n_free).
+    def discrepancy(self) -> Discrepancy | None:
+        """What parameters are wrong by because the network is coarse; None where trajectories leave no more than chance.
 
-        The noise of the readings tells how certain parameters are if the network is the whole truth. A coarse network is not, and
-        they make up for what it lacks: beside gradients within the nodes they end elsewhere. Averaged over both models (Hoeting
-        et al. 1999), the variance about the parameters of the one that is used has the square of that shift, and the variance
-        beside gradients, times the probability of these. The variance within the model that is used is counted in full, for
-        gradients are not all that a coarse network lacks.
+        Raises
+        ------
+        ArithmeticError
+            Where it cannot be told.
         """
-        calibration, gradients = self.calibration(), self.beside_any_gradients()
-        n = calibration.problem.n_free
+        gradients = self.beside_any_gradients()
         if gradients is None:
-            return np.zeros((n, n))
-        shift = gradients.optimum.unknowns[:n] - calibration.optimum.unknowns[:n]
-        within = attempted(gradients.covariance, "the covariance beside gradients within nodes", [])
-        covariance = np.outer(shift, shift) + (0.0 if within is None else within[:n, :n])
-        return float(expit(gradients.log_posterior - calibration.log_posterior)) * covariance
+            return None
+        left = float(np.mean(self._excess(gradients.residuals)))
+        return discrepancy(self.calibration(), gradients, max(0.0, 1.0 - left / mean_excess(self)))
 
     @once
     def along_trajectories(self) -> float:

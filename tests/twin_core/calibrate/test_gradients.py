@@ -17,7 +17,7 @@ from tests.twin_core.calibrate.body_with_gradients import (
     record,
     spec,
 )
-from twin_core.calibrate.gradients import BIOT, heat_flows_K, with_gradients
+from twin_core.calibrate.gradients import BIOT, conductances_W_per_K, heat_flows_K, with_gradients
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.effects import REGISTRY
 from twin_core.network.model import build_network
@@ -83,8 +83,10 @@ def test_flows_are_those_of_the_heat_balance() -> None:
         time_s, Q=power_W, T0=hot_K + power_W / G_W_PER_K + noise[:, 0], T1=np.full(100, hot_K) + noise[:, 1]
     )
     calibration = fit_network(load_spec(data), [steady])[1]
-    optimum = calibration.optimum
-    first, second = heat_flows_K(calibration.problem, optimum.unknowns, optimum.fit)
+    point = calibration.problem, calibration.optimum.unknowns, calibration.optimum.fit
+    conductance = conductances_W_per_K(*point)
+    assert conductance == pytest.approx([G_W_PER_K, G_W_PER_K + LEAK_W_PER_K])
+    first, second = heat_flows_K(*point, conductance)
     assert first[-1] * G_W_PER_K == pytest.approx([-power_W, power_W], rel=1e-3)
     assert second[-1] * (G_W_PER_K + LEAK_W_PER_K) == pytest.approx([power_W, -power_W], rel=1e-3)
 
@@ -116,13 +118,27 @@ def test_a_sensor_that_lags_reads_its_gradients_late() -> None:
     begun_K = unknowns[without.start_columns(0)]
     start = problem.start()
     start[problem.start_columns(0)] = [*begun_K, begun_K[0]]
-    with_lag = heat_flows_K(problem, start, problem.solve(start))
-    now = heat_flows_K(without, unknowns, plain.optimum.fit)
+    late_point, point = (problem, start, problem.solve(start)), (without, unknowns, plain.optimum.fit)
+    with_lag = heat_flows_K(*late_point, conductances_W_per_K(*late_point))
+    now = heat_flows_K(*point, conductances_W_per_K(*point))
     states = StateSpace(-1.0 / tau_s, 1.0 / tau_s, 1.0, 0.0)
     time_s = step_s * np.arange(400)
     for late, flow in zip(with_lag[0].T, now[0].T, strict=False):
         assert late == pytest.approx(lsim(states, flow, time_s, X0=flow[0])[1], abs=1e-3)
     assert with_lag[1] == pytest.approx(now[1], abs=1e-9)
+
+
+def test_flows_are_those_of_the_fit_beside_gradients() -> None:
+    """Not those of the fit without them, whose parameters make up for gradients; G is that of the fit without them."""
+    calibration = fitted(1.0)
+    problem, optimum = calibration.problem, calibration.optimum
+    found = with_gradients(problem, optimum)
+    conductance = conductances_W_per_K(problem, optimum.unknowns, optimum.fit)
+    flows = heat_flows_K(problem, found.optimum.unknowns, found.optimum.fit, conductance)
+    before = heat_flows_K(problem, optimum.unknowns, optimum.fit, conductance)
+    for mine, own, old in zip(found.flows_K, flows, before, strict=True):
+        assert mine == pytest.approx(own, rel=1e-12)
+        assert np.abs(own - old).max() > 0.05 * np.abs(own).max()
 
 
 def test_gradients_that_would_leave_too_much_are_not_fitted() -> None:
