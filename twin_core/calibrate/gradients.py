@@ -134,15 +134,13 @@ def with_gradients(
         Where sensitivities or heat flows are not finite.
     """
     conductance = conductances_W_per_K(problem, optimum.unknowns, optimum.fit)
-    flows_K = heat_flows_K(problem, optimum.unknowns, optimum.fit, conductance)
-    of_sensor = [slice(a, b) for a, b in pairwise(np.cumsum([0, *(flows.shape[1] for flows in flows_K)]))]
     mean, std = problem.prior()
 
     def at(unknowns: FloatArray, fit: Fit) -> _Point:
         flows_K = heat_flows_K(problem, unknowns, fit, conductance)
         if not all(np.isfinite(flows).all() for flows in flows_K):
             return _Point(unknowns, fit, flows_K, np.zeros((0, 0)), np.zeros(0), np.inf)
-        left_K, biot = _beside_gradients(problem, fit, flows_K, of_sensor)
+        left_K, biot = _beside_gradients(problem, fit, flows_K)
         against = float((((unknowns - mean) / std) ** 2).sum() + ((biot / BIOT) ** 2).sum())
         cost = 0.5 * (float(np.nansum((left_K / problem.noise_K) ** 2)) + against)
         return _Point(unknowns, fit, flows_K, left_K, biot, cost)
@@ -155,7 +153,7 @@ def with_gradients(
     enough = 0.5 * (1.0 + most_left) * float(np.isfinite(here.left_K).sum())
     for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
-        hessian, gradient = _equations(problem, optimum, here, of_sensor)
+        hessian, gradient = _equations(problem, optimum, here)
         if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ _solved(hessian, gradient)) > enough:
             return None
         while damping < MOST_DAMPING:
@@ -178,20 +176,24 @@ def with_gradients(
         ),
     )
     fit = replace(here.fit, cost=here.cost - 0.5 * float(((here.biot / BIOT) ** 2).sum()))
-    hessian, _ = _equations(problem, optimum, here, of_sensor)
+    hessian, _ = _equations(problem, optimum, here)
     found = Optimum(here.unknowns, fit, hessian[: problem.n_unknowns, : problem.n_unknowns], "converged", 0)
     whitener = fit_whitener(of_mean, left_K)
     against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())
     against += 0.5 * (problem.n_unknowns - problem.n_free) * float(np.log(problem.n_samples))
     log_posterior = whitener.log_likelihood - against - _averaged(whitener, here.flows_K)
-    biot = tuple(here.biot[own] for own in of_sensor)
+    biot = tuple(here.biot[own] for own in _of_sensor(here.flows_K))
     return WithGradients(of_mean, found, whitener, biot, log_posterior, here.flows_K)
 
 
-def _equations(
-    problem: Problem, optimum: Optimum, here: _Point, of_sensor: list[slice]
-) -> tuple[FloatArray, FloatArray]:
+def _of_sensor(flows_K: list[FloatArray]) -> list[slice]:
+    """Return where the b_l of each sensor stand among all."""
+    return [slice(a, b) for a, b in pairwise(np.cumsum([0, *(flows.shape[1] for flows in flows_K)]))]
+
+
+def _equations(problem: Problem, optimum: Optimum, here: _Point) -> tuple[FloatArray, FloatArray]:
     """Return Hessian (Gauss and Newton) and gradient of the cost over unknowns and all b_l."""
+    of_sensor = _of_sensor(here.flows_K)
     mean, std = problem.prior()
     hessian = block_diag(np.diag(1.0 / std**2), np.eye(here.biot.size) / BIOT**2)
     gradient = np.concatenate([(here.unknowns - mean) / std**2, here.biot / BIOT**2])
@@ -206,13 +208,11 @@ def _equations(
     return hessian, gradient
 
 
-def _beside_gradients(
-    problem: Problem, fit: Fit, flows_K: list[FloatArray], of_sensor: list[slice]
-) -> tuple[FloatArray, FloatArray]:
+def _beside_gradients(problem: Problem, fit: Fit, flows_K: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return what a fit leaves beside the gradients that explain most of it, (n_rows, n_sensors), and their b_l."""
     left_K = np.concatenate(problem.residuals(fit))
     biot = np.zeros(sum(flows.shape[1] for flows in flows_K))
-    for sensor, (flows, own) in enumerate(zip(flows_K, of_sensor, strict=True)):
+    for sensor, (flows, own) in enumerate(zip(flows_K, _of_sensor(flows_K), strict=True)):
         seen = np.isfinite(left_K[:, sensor])
         rows = flows[seen] / problem.noise_K[sensor]
         hessian = rows.T @ rows + np.eye(flows.shape[1]) / BIOT**2
@@ -248,6 +248,7 @@ def conductances_W_per_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> Fl
 
 
 def _conductances_W_per_K(network: Network, links: list[list["_Link"]]) -> FloatArray:
+    """The same of the heat flows per segment."""
     found = np.zeros(len(network.nodes))
     for link in (link for of_segment in links for link in of_segment):
         found[link.node] += link.conductance_W_per_K / len(links)
