@@ -27,7 +27,8 @@ CAN_FORK = sys.platform == "linux"
 
 _INDEX_BYTES = 2
 
-_is_forked = False
+_free: tuple[int, int] | None = None
+"""In the processes of a piece of work: a pipe with one byte for each core that has nothing to do, as of make's job server."""
 
 
 def n_cores() -> int:
@@ -39,8 +40,8 @@ def side_by_side(works: Sequence[Callable[[], T]]) -> list[T]:
     """Return what each of some pieces of work returns, done on all cores.
 
     What they change is lost; what they raise is raised here, that of the first one that did. Within a piece, further pieces are
-    done one after the other. So are all that are asked for by another thread than the main one: beside it there are others, and
-    what they have locked stays locked in a fork.
+    done one after the other, until a core has nothing else to do. So are all that are asked for by another thread than the main
+    one: beside it there are others, and what they have locked stays locked in a fork.
 
     Parameters
     ----------
@@ -57,18 +58,22 @@ def ahead(works: Sequence[Callable[[], T]]) -> Iterator[Callable[[int], T]]:
 
     From the first that is asked for on, others are under way; those are given up with the context.
     """
-    n_processes = min(len(works), n_cores())
-    if n_processes < 2 or _is_forked or current_thread() is not main_thread():
-        yield lambda i: works[i]()
-        return
-    coming, told = _told(works, n_processes), dict[int, tuple[bool, T | Exception]]()
+    left, told = list(range(len(works))), dict[int, tuple[bool, T | Exception]]()
+    coming: Generator[tuple[int, tuple[bool, T | Exception]], None, None] | None = None
 
     def result(i: int) -> T:
-        while i not in told:
+        nonlocal coming
+        if coming is None and (n_more := _cores_for(len(left))):
+            coming = _told(works, left, n_more)
+        while coming is not None and i not in told:
             one = next(coming, None)
             if one is None:  # a process that was killed, or could not send what it had made, has left its work undone
-                return works[i]()
+                break
             told.update([one])
+        if i not in told:
+            if i in left:
+                left.remove(i)
+            return works[i]()
         returned, value = told.pop(i)
         if not returned:
             raise cast(BaseException, value)
@@ -77,7 +82,20 @@ def ahead(works: Sequence[Callable[[], T]]) -> Iterator[Callable[[int], T]]:
     try:
         yield result
     finally:
-        coming.close()
+        if coming is not None:
+            coming.close()
+
+
+def _cores_for(n_works: int) -> int:
+    """Return on how many cores beside this process's own some pieces of work may be done; nobody else uses them from now on."""
+    if n_works < 2 or not CAN_FORK or current_thread() is not main_thread():
+        return 0
+    if _free is None:
+        return min(n_works, n_cores()) - 1
+    try:
+        return len(os.read(_free[0], n_works - 1))
+    except BlockingIOError:
+        return 0
 
 
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
@@ -87,18 +105,29 @@ def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
 
 
 def _told(
-    works: Sequence[Callable[[], T]], n_processes: int
+    works: Sequence[Callable[[], T]], numbers: Sequence[int], n_more: int
 ) -> Generator[tuple[int, tuple[bool, T | Exception]], None, None]:
-    """Yield the number of each piece of work that is done, whether it returned, and what it returned or raised."""
+    """Yield the number of each piece of work that is done, whether it returned, and what it returned or raised.
+
+    It is done on ``n_more`` cores and on that of this process, which waits. Cores are free again as soon as nothing is left for
+    them.
+    """
+    global _free
     known = _reachable(works)
     todo, end_of_todo = os.pipe()
     alive, end_of_alive = os.pipe()
-    os.write(end_of_todo, b"".join(i.to_bytes(_INDEX_BYTES, "little") for i in range(len(works))))
+    os.write(end_of_todo, b"".join(i.to_bytes(_INDEX_BYTES, "little") for i in numbers))
     os.close(end_of_todo)  # whoever reads beyond the last number learns that nothing is left
+    is_outermost = _free is None
+    if is_outermost:
+        _free = os.pipe()
+        os.set_blocking(_free[0], False)
+        os.write(_free[1], bytes(max(0, n_cores() - n_more - 1)))
+    free = cast(tuple[int, int], _free)
     processes: list[int] = []
     receivers: list[Connection] = []
     try:
-        for _ in range(n_processes):
+        for _ in range(n_more + 1):
             receiver, sender = Pipe(duplex=False)
             process = os.fork()
             if process == 0:
@@ -114,6 +143,8 @@ def _told(
                 except (EOFError, OSError):
                     receiver.close()
                     receivers.remove(receiver)
+                    if n_more:
+                        n_more -= os.write(free[1], bytes(1))
                 else:
                     yield _loaded(content, known)
     finally:
@@ -124,14 +155,17 @@ def _told(
         for process in processes:
             with suppress(ChildProcessError):
                 os.waitpid(process, 0)
+        os.write(free[1], bytes(n_more))
+        if is_outermost:
+            _free = None
+            for descriptor in free:
+                os.close(descriptor)
 
 
 def _work(
     works: Sequence[Callable[[], object]], known: dict[int, object], todo: int, alive: int, sender: Connection
 ) -> None:
     """Do work until none is left: the whole life of a forked process."""
-    global _is_forked
-    _is_forked = True
     status = 1
     try:
         Thread(target=_end_with, args=(alive,), daemon=True).start()

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -114,11 +115,70 @@ def test_costly_values_that_were_computed_elsewhere_are_kept() -> None:
     assert models[1].log == []
 
 
-def test_work_within_work_is_done_one_after_the_other() -> None:
-    def nested() -> set[int]:
-        return {os.getpid(), *side_by_side([os.getpid, os.getpid])}
+def test_work_within_work_is_done_one_after_the_other_while_all_cores_are_busy(tmp_path: Path) -> None:
+    def nested(i: int) -> set[int]:
+        processes = {os.getpid(), *side_by_side([os.getpid, os.getpid])}
+        (tmp_path / str(i)).touch()
+        while len(os.listdir(tmp_path)) < 2:
+            time.sleep(0.01)
+        return processes
 
-    assert [len(processes) for processes in side_by_side([nested, nested])] == [1, 1]
+    assert [len(processes) for processes in side_by_side([partial(nested, i) for i in range(2)])] == [1, 1]
+
+
+def test_a_core_with_nothing_left_to_do_takes_over_work_within_work() -> None:
+    def long() -> bool:
+        while not _takes_both_cores():
+            time.sleep(0.01)
+        return True
+
+    assert side_by_side([long, lambda: False]) == [True, False]
+
+
+def test_a_core_is_free_again_after_work_that_failed_was_given_up_or_was_killed() -> None:
+    def failing() -> None:
+        raise ValueError
+
+    def given_up() -> None:
+        with ahead([os.getpid, partial(time.sleep, 600.0)]) as result:
+            result(0)
+
+    def killed() -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def long() -> list[bool]:
+        both_cores = []
+        for disturb in (failing, given_up, killed):
+            for _ in range(20):
+                while not _takes_both_cores():
+                    time.sleep(0.01)
+                here = os.getpid()
+                with suppress(ValueError):
+                    side_by_side([lambda d=disturb, h=here: d() if os.getpid() != h else None, os.getpid])
+            both_cores.append(_takes_both_cores())
+        return both_cores
+
+    assert side_by_side([long, os.getpid])[0] == [True] * 3
+
+
+def _takes_both_cores() -> bool:
+    return os.getpid() not in side_by_side([os.getpid, os.getpid])
+
+
+def test_a_core_that_becomes_free_takes_over_what_is_left() -> None:
+    here = os.getpid()
+
+    def one() -> int:
+        time.sleep(0.05)
+        return os.getpid()
+
+    def long() -> list[int]:
+        return [os.getpid(), *side_by_side([one] * 40)]
+
+    own, *processes = side_by_side([long, partial(time.sleep, 0.3)])[0]
+    assert own != here
+    assert processes[0] == own
+    assert len(set(processes)) == 3
 
 
 def test_another_thread_does_not_fork() -> None:

@@ -23,7 +23,7 @@ from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
-from twin_core.side_by_side import both
+from twin_core.side_by_side import ahead, both
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
@@ -276,18 +276,31 @@ def with_noise_beside(problem: Problem, unknowns: FloatArray) -> Problem:
     return replace(problem, noise_K=noise_beside_K(problem.network.spec, records, problem.noise_K, left_K))
 
 
-def from_heat_fit(fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = (), afresh: bool = True) -> Calibration:
-    """Return the open-loop calibration that starts from a fit in the presence of undeclared heat.
+def from_heat_fit(
+    fit: HeatFit, max_step_s: float, *, near: Sequence[Optimum] = (), starts: Sequence[FloatArray] = ()
+) -> Calibration:
+    """Return the open-loop calibration that starts from a fit in the presence of undeclared heat, the best of all that it finds.
 
-    ``near`` are optima of the same problem found otherwise: the best of all is kept. Not ``afresh`` they are all there are.
+    Parameters
+    ----------
+    fit, max_step_s
+        The fit, and the longest time step.
+    near
+        Optima of the same problem found otherwise.
+    starts
+        Unknowns to start from too, (n_unknowns,) each. Where one of all these has converged, the fit's own are no start.
 
     Raises
     ------
     ArithmeticError
         Where the heat balance has a solution from none of them.
     """
-    own = [minimise(fit.problem, fit.unknowns())] if afresh else []
-    best = min([*own, *near], key=lambda o: o.fit.cost)
+    optima = list(near)
+    with ahead([partial(minimise, fit.problem, start) for start in (*starts, fit.unknowns())]) as found:
+        optima += [found(i) for i in range(len(starts))]
+        if not any(optimum.status == "converged" for optimum in optima):
+            optima.append(found(len(starts)))
+    best = min(reversed(optima), key=lambda o: o.fit.cost)
     if not np.isfinite(best.fit.cost):
         raise ArithmeticError("the heat balance has no open-loop solution at the fitted parameters")
     return Calibration(fit.problem, best, fit_whitener(fit.problem, fit.problem.residuals(best.fit)), max_step_s)

@@ -74,6 +74,7 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         return finding
     least = (1.0 - policy.REPEATABLE_SHARE) * explained(simple, state.trial)
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
+    goal = _cost_of_explaining(simple, state.trial, least)
     fitted_before, found = simple.calibration(), state.trial.calibration()
     bare = state.attempt(partial(_bare, simple, found), "the parameters found, without " + own.label) or fitted_before
     what = f"names that may explain what {own.label} does"
@@ -87,7 +88,10 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     ]
     fitted = state.attempt_each(
         [
-            (partial(_explaining, simple, starts, effect, state.trial, least), f"{effect.label} instead of {own.label}")
+            (
+                partial(_explaining, simple, starts, effect, state.trial, least, goal),
+                f"{effect.label} instead of {own.label}",
+            )
             for effect, starts in options
         ]
     )
@@ -171,18 +175,36 @@ def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place])
     return refined(about, shortlist(others, 0.0, N_BESIDE_GRADIENTS))
 
 
+def _cost_of_explaining(simple: Trial, found: Trial, least: float) -> float:
+    """Return the cost above which nothing explains as much of what a simpler trial leaves as :func:`explained` is asked for.
+
+    Gradients can take no more from what an effect leaves than their share, and a sensor's noise counts up to ``LARGEST_NOISE``
+    times what costs are weighed by.
+    """
+    share = found.share_of_gradients()
+    if share >= 1.0:
+        return np.inf
+    stays = max(simple.left_beside(share), mean_excess(simple) - policy.MOST_COARSENESS) - least
+    n_readings = sum(segment.valid.sum(axis=0) for segment in simple.fit.problem.segments)
+    mean_square = (1.0 + stays / (1.0 - share)) * policy.LARGEST_NOISE**2
+    return float(0.5 * mean_square * n_readings.size * n_readings.max())
+
+
 def _explaining(
-    simple: Trial, starts: Sequence[Calibration], effect: Effect, found: Trial, least: float
+    simple: Trial, starts: Sequence[Calibration], effect: Effect, found: Trial, least: float, goal: float
 ) -> Trial | None:
     """Return an effect on top of a trial, fitted on trajectories, if it is as good a name as what was found.
 
-    It explains so much, gradients as with what was found, or the readings hardly tell it from that, or are likelier.
+    It explains so much, gradients as with what was found, or the readings hardly tell it from that, or are likelier. Of one that
+    would explain far less, at a cost above ``goal``, only wandering heat is asked beside it.
     """
-    trial = try_on_trajectories(simple, (*simple.present_effects, effect), *starts)
+    trial = try_on_trajectories(simple, (*simple.present_effects, effect), *starts, goal=goal)
     if trial is None:
         return None
-    as_much = explained(simple, trial, found) >= least
-    return trial if as_much or trial.log_evidence() > found.log_evidence() - policy.ALTERNATIVE_NATS else None
+    enough = found.log_evidence() - policy.ALTERNATIVE_NATS
+    if trial.near[0].status == "given_up":
+        return trial if trial.least_evidence > enough else None
+    return trial if explained(simple, trial, found) >= least or trial.log_evidence() > enough else None
 
 
 def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:

@@ -73,15 +73,12 @@ class Trial:
     @once
     def calibration(self) -> Calibration:
         """The same model calibrated on open-loop trajectories."""
-        near = list(self.near)
+        starts = []
         if self.simpler is not None:
             values = self.fit.network.parameters.as_dict()
             simpler = self.simpler.calibration()
-            start = carried_over(simpler.problem, simpler.optimum.unknowns, self.fit.problem, values)
-            near.append(minimise(self.fit.problem, start))
-        return from_heat_fit(
-            self.fit, self.max_step_s, near=near, afresh=not any(o.status == "converged" for o in near)
-        )
+            starts.append(carried_over(simpler.problem, simpler.optimum.unknowns, self.fit.problem, values))
+        return from_heat_fit(self.fit, self.max_step_s, near=self.near, starts=starts)
 
     @property
     def present_effects(self) -> tuple[Effect, ...]:
@@ -195,7 +192,8 @@ class Trial:
 
     def left_beside(self, share: float) -> float:
         """Return the mean of :attr:`excess` over sensors, less a share of what gradients within the nodes explain of it."""
-        gradients, left = self.beside_gradients(), mean_excess(self)
+        left = mean_excess(self)
+        gradients = self.beside_gradients() if share > 0.0 else None
         if gradients is None:
             return left
         return (1.0 - share) * left + share * float(np.mean(self._excess(gradients.residuals)))
@@ -313,14 +311,14 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
 
 
 def try_on_trajectories(
-    base: Trial, effects: Sequence[Effect], *starts: Calibration, beside_heat: bool = False
+    base: Trial, effects: Sequence[Effect], *starts: Calibration, beside_heat: bool = False, goal: float = np.inf
 ) -> Trial | None:
     """Return the trial of a set of effects fitted on open-loop trajectories, started from the simpler one's optimum.
 
     Or from other ``starts`` of the simpler problem; with ``beside_heat`` from its fit beside undeclared heat too, and
     the best one counts: where much is missing, parameters that are to follow long trajectories alone lie far from where the
     effect belongs. Where the balance has no solution there, what is new starts smaller; None where it has none even so. The
-    undeclared heat is sized about the result, for a later look.
+    undeclared heat is sized about the result, for a later look. Fits that would not come to the cost of ``goal`` are given up.
     """
     problem = extended(base.fit.problem, effects)
     along = [(start.problem, start.optimum.unknowns) for start in starts or (base.calibration(),)]
@@ -329,7 +327,7 @@ def try_on_trajectories(
     for share in (1.0, *SHORTER_SHARES):
         some = [e if share == 1.0 or e.place in there else e.shortened(share) for e in effects]
         own = {p.name: p.value for effect in some for p in effect.parameters()}
-        optima = [minimise(problem, carried_over(*simpler, problem, own)) for simpler in along]
+        optima = [minimise(problem, carried_over(*simpler, problem, own), goal=goal) for simpler in along]
         optimum = min(optima, key=lambda o: np.inf if o.status == "no_solution" else o.fit.cost)
         if optimum.status != "no_solution":
             break

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from tests.helpers import at_named, conductive_spec, record_of
 from twin_core.calibrate.normal_equations import normal_equations
-from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.optimise import PACE_STEPS, minimise
 from twin_core.calibrate.problem import Problem, build_problem
 from twin_core.constants import STEFAN_BOLTZMANN_W_PER_M2_K4
 from twin_core.effects import REGISTRY
@@ -134,3 +134,20 @@ def test_a_record_too_long_for_its_derivatives_is_fitted_without_them(monkeypatc
     optimum = minimise(p, accelerated=True)
     assert optimum.status == "converged"
     assert optimum.fit.cost < p.solve(p.start()).cost
+
+
+def test_a_search_that_would_not_come_to_its_goal_is_given_up() -> None:
+    p = problem(AREA_M2)
+    free = minimise(p)
+    given_up = minimise(p, goal=0.0)
+    assert given_up.status == "given_up"
+    assert PACE_STEPS <= given_up.iterations < free.iterations
+    assert free.fit.cost <= given_up.fit.cost < p.solve(p.start()).cost
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0, 30.0, 100.0])
+def test_a_search_that_comes_to_its_goal_is_not_given_up(factor: float) -> None:
+    p = problem(factor * AREA_M2)
+    free = minimise(p)
+    led = minimise(p, goal=1.01 * free.fit.cost)
+    assert (led.status, led.iterations, led.fit.cost) == (free.status, free.iterations, free.fit.cost)

@@ -43,6 +43,10 @@ class Problem:
     radiated: tuple[str, ...] = ()
 
     @property
+    def segments(self) -> list[SimpleNamespace]:
+        return [SimpleNamespace(valid=np.ones((N_READINGS // 2, 2), dtype=bool))]
+
+    @property
     def network(self) -> SimpleNamespace:
         conductors = [SimpleNamespace(between=("a", boundary)) for boundary in self.conducted]
         radiators = [SimpleNamespace(node="a", sink=boundary) for boundary in self.radiated]

@@ -3,15 +3,18 @@
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.twin_core.discover.stubs import CHANCE, JUST, NEEDED, judged, load, stub
 from twin_core.discover import alternatives, trajectories
-from twin_core.discover.alternatives import add_coarse_alternatives
+from twin_core.discover.alternatives import _cost_of_explaining, add_coarse_alternatives
 from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Search
-from twin_core.discover.policy import ALTERNATIVE_NATS, REPEATABLE_SHARE
-from twin_core.discover.trial import Trial
+from twin_core.discover.policy import ALTERNATIVE_NATS, LARGEST_NOISE, REPEATABLE_SHARE
+from twin_core.discover.trial import Trial, explained
 from twin_core.effects.base import Effect
 
 BEFORE, LEFT = 10.0, 2.0
@@ -25,7 +28,8 @@ class Fits:
         self.rough, self.fine = dict(zip(("bare", "fitted"), left, strict=True)), nats
         self.settled: list[float] = []
         self.beside: list[str] = []
-        self.likelier = -1e3
+        self.likelier = self.least = -1e3
+        self.status = "converged"
         self.simple: Any = stub(left=BEFORE)
         self.simple.present_effects, self.simple.calibration = (), lambda: "fitted"
         self.found = self.with_a(LEFT)
@@ -50,9 +54,11 @@ class Fits:
         made: Any = stub(load("b"), left=left)
         made.nats = nats
         made.log_evidence = lambda: self.likelier
+        made.near, made.least_evidence = (SimpleNamespace(status=self.status),), self.least
         return made
 
-    def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any) -> Any:
+    def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any, goal: float) -> Any:
+        self.goal = goal
         return self.trial(min(self.rough[str(start)] for start in starts), self.fine[0])
 
     def resettled(self, simple: Trial, rich: Any) -> Any:
@@ -109,6 +115,47 @@ def test_an_alternative_that_the_readings_hardly_tell_from_what_was_found_may_ex
     fits = Fits(monkeypatch, (BEFORE, BEFORE), (9.0, 9.0))
     fits.likelier = likelier
     assert fits.told() == told
+
+
+@pytest.mark.parametrize(
+    ("least", "told"),
+    [(-ALTERNATIVE_NATS, []), (-ALTERNATIVE_NATS + JUST, ["b"])],
+    ids=["too unlikely", "by wandering heat"],
+)
+def test_of_a_fit_that_was_given_up_wandering_heat_alone_is_asked(
+    monkeypatch: pytest.MonkeyPatch, least: float, told: list[str]
+) -> None:
+    fits = Fits(monkeypatch, (BEFORE, BEFORE), (9.0, 9.0))
+    fits.status, fits.likelier, fits.least = "given_up", 90.0, least
+    assert fits.told() == told
+
+
+@given(seed=st.integers(0, 2**32 - 1), share=st.floats(0.0, 0.9), noise=st.floats(0.1, 2.0))
+def test_what_costs_more_than_the_goal_explains_too_little(seed: int, share: float, noise: float) -> None:
+    """Whatever gradients take of what is left, however readings are spread over sensors, and whatever the noise is known to."""
+    rng = np.random.default_rng(seed)
+    n_sensors = int(rng.integers(1, 4))
+    valid = rng.random((200, n_sensors)) < rng.random(n_sensors)
+    valid[0] = True
+    scaled = rng.lognormal(0.5) * rng.standard_normal((200, n_sensors)) * rng.lognormal(0.0, 1.0, n_sensors)
+    mean_square = np.array([np.mean(scaled[valid[:, i], i] ** 2) for i in range(n_sensors)])
+    left = float(np.mean(np.maximum(mean_square / min(noise, LARGEST_NOISE) ** 2 - 1.0, 0.0)))
+    beside = left * rng.random()
+    simple: Any = stub(left=BEFORE)
+    simple.fit = SimpleNamespace(problem=SimpleNamespace(segments=[SimpleNamespace(valid=valid)]))
+    found: Any = stub(load("a"), left=LEFT)
+    found.share_of_gradients = lambda: share
+    rich: Any = stub(load("b"), left=left)
+    rich.left_beside = lambda share: (1.0 - share) * left + share * beside
+    least = (1.0 - REPEATABLE_SHARE) * explained(simple, found)
+    if 0.5 * float(np.sum(scaled[valid] ** 2)) > _cost_of_explaining(simple, found, least):
+        assert explained(simple, rich, found) < least
+
+
+def test_where_gradients_may_take_all_that_is_left_no_fit_is_given_up() -> None:
+    found: Any = stub(load("a"), left=LEFT)
+    found.share_of_gradients = lambda: 1.0
+    assert _cost_of_explaining(stub(left=BEFORE), found, 1.0) == np.inf
 
 
 def test_what_stands_out_beside_gradients_is_fitted_from_both_of_their_optima(monkeypatch: pytest.MonkeyPatch) -> None:
