@@ -149,7 +149,7 @@ def test_a_core_is_free_again_after_work_that_failed_was_given_up_or_was_killed(
     def long() -> list[bool]:
         both_cores = []
         for disturb in (failing, given_up, killed):
-            for _ in range(20):
+            for _ in range(4):
                 while not _takes_both_cores():
                     time.sleep(0.01)
                 here = os.getpid()

@@ -23,7 +23,7 @@ from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
-from twin_core.side_by_side import ahead, both
+from twin_core.side_by_side import both
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
 
@@ -295,11 +295,9 @@ def from_heat_fit(
     ArithmeticError
         Where the heat balance has a solution from none of them.
     """
-    optima = list(near)
-    with ahead([partial(minimise, fit.problem, start) for start in (*starts, fit.unknowns())]) as found:
-        optima += [found(i) for i in range(len(starts))]
-        if not any(optimum.status == "converged" for optimum in optima):
-            optima.append(found(len(starts)))
+    optima = [*near, *(minimise(fit.problem, start) for start in starts)]
+    if not any(optimum.status == "converged" for optimum in optima):
+        optima.append(minimise(fit.problem, fit.unknowns()))
     best = min(reversed(optima), key=lambda o: o.fit.cost)
     if not np.isfinite(best.fit.cost):
         raise ArithmeticError("the heat balance has no open-loop solution at the fitted parameters")

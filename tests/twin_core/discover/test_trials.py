@@ -97,10 +97,10 @@ def test_trajectories_are_fitted_from_where_the_undeclared_heat_left_the_paramet
     lost = replace(base.calibration(), optimum=replace(base.calibration().optimum, unknowns=astray))
     started: list[float] = []
 
-    def caught(problem: Problem, unknowns: FloatArray) -> Optimum:
+    def caught(problem: Problem, unknowns: FloatArray, *, goal: float) -> Optimum:
         """Return where a search ends that leaves no valley: where it has begun."""
         started.append(float(unknowns[problem.network.parameters.free_names.index("C:n0")]))
-        return minimise(problem, unknowns, max_iterations=0)
+        return minimise(problem, unknowns, max_iterations=0, goal=goal)
 
     monkeypatch.setattr(trial_module, "minimise", caught)
     effect = right.effects[0]
