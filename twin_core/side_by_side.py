@@ -11,6 +11,7 @@ import pickle
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection, Pipe, wait
 from threading import RLock, Thread, current_thread, main_thread
@@ -22,13 +23,37 @@ import numpy as np
 T = TypeVar("T")
 U = TypeVar("U")
 
+
+@dataclass
+class _UnderWay:
+    """Processes that this one has forked, which end with the last end of a pipe, and how many cores besides its own they use."""
+
+    alive: tuple[int, int]
+    n_more: int
+    processes: list[int] = field(default_factory=list)
+
+    def end(self, free: tuple[int, int]) -> None:
+        """End them, wait until they have, and give their cores back."""
+        for descriptor in self.alive:
+            os.close(descriptor)
+        for process in self.processes:
+            with suppress(ChildProcessError):
+                os.waitpid(process, 0)
+        os.write(free[1], bytes(self.n_more))
+
+
 CAN_FORK = sys.platform == "linux"
 """Elsewhere a fork of a process that has used its system's libraries is not safe, and work is done one after the other."""
 
 _INDEX_BYTES = 2
 
 _free: tuple[int, int] | None = None
-"""In the processes of a piece of work: a pipe with one byte for each core that has nothing to do, as of make's job server."""
+"""While work is done: a pipe with one byte for each core that has nothing to do, as of make's job server."""
+
+_under_way: list["_UnderWay"] = []
+"""What this process waits for, the innermost last."""
+
+_is_forked = False
 
 
 def n_cores() -> int:
@@ -115,26 +140,25 @@ def _told(
     global _free
     known = _reachable(works)
     todo, end_of_todo = os.pipe()
-    alive, end_of_alive = os.pipe()
     os.write(end_of_todo, b"".join(i.to_bytes(_INDEX_BYTES, "little") for i in numbers))
     os.close(end_of_todo)  # whoever reads beyond the last number learns that nothing is left
-    is_outermost = _free is None
-    if is_outermost:
+    if _free is None:
         _free = os.pipe()
         os.set_blocking(_free[0], False)
         os.write(_free[1], bytes(max(0, n_cores() - n_more - 1)))
-    free = cast(tuple[int, int], _free)
-    processes: list[int] = []
+    free, own = _free, _UnderWay(os.pipe(), n_more)
+    _under_way.append(own)
     receivers: list[Connection] = []
     try:
         for _ in range(n_more + 1):
             receiver, sender = Pipe(duplex=False)
             process = os.fork()
             if process == 0:
-                os.close(end_of_alive)
-                _work(works, known, todo, alive, sender)
+                for one in _under_way:
+                    os.close(one.alive[1])
+                _work(works, known, todo, own.alive[0], sender)
             sender.close()
-            processes.append(process)
+            own.processes.append(process)
             receivers.append(receiver)
         while receivers:
             for receiver in cast(list[Connection], wait(receivers)):
@@ -143,20 +167,17 @@ def _told(
                 except (EOFError, OSError):
                     receiver.close()
                     receivers.remove(receiver)
-                    if n_more:
-                        n_more -= os.write(free[1], bytes(1))
+                    if own.n_more:
+                        own.n_more -= os.write(free[1], bytes(1))
                 else:
                     yield _loaded(content, known)
     finally:
-        for descriptor in (todo, alive, end_of_alive):
-            os.close(descriptor)  # the processes end with the last of these, whatever ended the work
+        os.close(todo)
         for receiver in receivers:
             receiver.close()
-        for process in processes:
-            with suppress(ChildProcessError):
-                os.waitpid(process, 0)
-        os.write(free[1], bytes(n_more))
-        if is_outermost:
+        _under_way.remove(own)
+        own.end(free)
+        if not (_under_way or _is_forked):
             _free = None
             for descriptor in free:
                 os.close(descriptor)
@@ -166,6 +187,8 @@ def _work(
     works: Sequence[Callable[[], object]], known: dict[int, object], todo: int, alive: int, sender: Connection
 ) -> None:
     """Do work until none is left: the whole life of a forked process."""
+    global _is_forked, _under_way
+    _is_forked, _under_way = True, []
     status = 1
     try:
         Thread(target=_end_with, args=(alive,), daemon=True).start()
@@ -189,6 +212,9 @@ def _work(
 def _end_with(alive: int) -> None:
     """End this process when the one that forked it does, however it ends: nobody would want the result."""
     os.read(alive, 1)
+    for own in reversed(_under_way):
+        with suppress(OSError):  # it is ending already
+            own.end(cast(tuple[int, int], _free))
     os._exit(1)
 
 

@@ -165,6 +165,43 @@ def _takes_both_cores() -> bool:
     return os.getpid() not in side_by_side([os.getpid, os.getpid])
 
 
+def test_what_is_given_up_ends_with_all_that_it_has_forked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing goes on, nothing is left for another process to wait for, and the cores are free again."""
+    monkeypatch.setattr(module, "n_cores", lambda: 3)
+
+    def endless() -> None:
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(600.0)
+
+    def long() -> None:
+        while True:
+            side_by_side([endless, endless])
+
+    def once_begun() -> None:
+        stop = time.monotonic() + 20.0
+        while len(os.listdir(tmp_path)) < 2 and time.monotonic() < stop:
+            time.sleep(0.01)
+
+    def work() -> bool:
+        while not _takes_both_cores():
+            time.sleep(0.01)
+        return True
+
+    with ahead([once_begun, long]) as result:
+        result(0)
+    assert not any(Path(f"/proc/{name}").exists() for name in os.listdir(tmp_path))
+    assert side_by_side([work, os.getpid])[0]
+
+
+def test_contexts_that_are_left_crosswise_share_their_cores() -> None:
+    with ahead([os.getpid] * 3) as outer:
+        with ahead([os.getpid] * 3) as inner:
+            inner(0)
+            outer(0)
+        assert outer(1) != os.getpid()
+    assert _takes_both_cores()
+
+
 def test_a_core_that_becomes_free_takes_over_what_is_left() -> None:
     here = os.getpid()
 

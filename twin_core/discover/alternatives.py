@@ -179,7 +179,7 @@ def _cost_of_explaining(simple: Trial, found: Trial, least: float) -> float:
     """Return the cost above which nothing explains as much of what a simpler trial leaves as :func:`explained` is asked for.
 
     Gradients can take no more from what an effect leaves than their share, and a sensor's noise counts up to ``LARGEST_NOISE``
-    times what costs are weighed by.
+    times what costs are weighed by. What parameters cost that go against their priors is a part of no bound: it is small.
     """
     share = found.share_of_gradients()
     if share >= 1.0:
