@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection, Pipe, wait
-from threading import RLock, Thread, current_thread, main_thread
+from threading import Lock, RLock, Thread, current_thread, main_thread
 from types import FunctionType, MethodType, ModuleType
 from typing import Any, TypeVar, cast
 
@@ -35,11 +35,13 @@ class _UnderWay:
     def end(self, free: tuple[int, int]) -> None:
         """End them, wait until they have, and give their cores back."""
         for descriptor in self.alive:
-            os.close(descriptor)
+            with suppress(OSError):  # the thread that ends this process may do the same
+                os.close(descriptor)
         for process in self.processes:
             with suppress(ChildProcessError):
                 os.waitpid(process, 0)
-        os.write(free[1], bytes(self.n_more))
+        n_more, self.n_more = self.n_more, 0
+        os.write(free[1], bytes(n_more))
 
 
 CAN_FORK = sys.platform == "linux"
@@ -54,6 +56,9 @@ _under_way: list["_UnderWay"] = []
 """What this process waits for, the innermost last."""
 
 _is_forked = False
+
+_forking = Lock()
+"""Held while this process forks, and by the thread that ends it, so that nothing is forked any more."""
 
 
 def n_cores() -> int:
@@ -152,13 +157,14 @@ def _told(
     try:
         for _ in range(n_more + 1):
             receiver, sender = Pipe(duplex=False)
-            process = os.fork()
-            if process == 0:
-                for one in _under_way:
-                    os.close(one.alive[1])
-                _work(works, known, todo, own.alive[0], sender)
+            with _forking:
+                process = os.fork()
+                if process == 0:
+                    for one in _under_way:
+                        os.close(one.alive[1])
+                    _work(works, known, todo, own.alive[0], sender)
+                own.processes.append(process)
             sender.close()
-            own.processes.append(process)
             receivers.append(receiver)
         while receivers:
             for receiver in cast(list[Connection], wait(receivers)):
@@ -175,8 +181,8 @@ def _told(
         os.close(todo)
         for receiver in receivers:
             receiver.close()
-        _under_way.remove(own)
         own.end(free)
+        _under_way.remove(own)
         if not (_under_way or _is_forked):
             _free = None
             for descriptor in free:
@@ -187,8 +193,8 @@ def _work(
     works: Sequence[Callable[[], object]], known: dict[int, object], todo: int, alive: int, sender: Connection
 ) -> None:
     """Do work until none is left: the whole life of a forked process."""
-    global _is_forked, _under_way
-    _is_forked, _under_way = True, []
+    global _is_forked, _under_way, _forking
+    _is_forked, _under_way, _forking = True, [], Lock()
     status = 1
     try:
         Thread(target=_end_with, args=(alive,), daemon=True).start()
@@ -212,9 +218,9 @@ def _work(
 def _end_with(alive: int) -> None:
     """End this process when the one that forked it does, however it ends: nobody would want the result."""
     os.read(alive, 1)
+    _forking.acquire()
     for own in reversed(_under_way):
-        with suppress(OSError):  # it is ending already
-            own.end(cast(tuple[int, int], _free))
+        own.end(cast(tuple[int, int], _free))
     os._exit(1)
 
 
