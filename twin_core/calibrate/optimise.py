@@ -129,9 +129,9 @@ def minimise(
         Whether a flat valley is followed to its end, at two or three times the work of a step: for a model that is to stay, not
         for the many that a search only compares.
     goal
-        Cost from which the result is of use: a search that would not come to it at ``LEEWAY`` times the pace of its last
-        ``PACE_STEPS`` is given up. It has the steps that are left, and as many again as there are, for what comes near is taken
-        to its end by a second search.
+        Cost of the readings, priors apart, from which the result is of use: a search that would not come to it at ``LEEWAY``
+        times the pace of its last ``PACE_STEPS`` is given up. It has the steps that are left, and as many again as there are,
+        for what comes near is taken to its end by a second search.
 
     Returns
     -------
@@ -178,7 +178,7 @@ def minimise(
                 status = "converged"
                 break
             pace = (costs[-1 - PACE_STEPS] - fit.cost) / PACE_STEPS if iterations >= PACE_STEPS else np.inf
-            if fit.cost - LEEWAY * pace * (2 * max_iterations - iterations) > goal:
+            if fit.cost - problem.prior_cost(x) - LEEWAY * pace * (2 * max_iterations - iterations) > goal:
                 status = "given_up"
                 break
         elif 0.0 <= move.predicted <= enough:

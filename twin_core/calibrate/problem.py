@@ -181,6 +181,11 @@ class Problem:
         std = np.concatenate([self.network.parameters.prior_std, *(s.start_std_K for s in self.segments)])
         return mean, std
 
+    def prior_cost(self, unknowns: FloatArray) -> float:
+        """Return the part of the cost that is the prior's, in nats."""
+        mean, std = self.prior()
+        return 0.5 * float(np.sum(((unknowns - mean) / std) ** 2))
+
     def start_columns(self, segment: int) -> slice:
         """Return where the initial temperatures of a segment stand in the unknown vector."""
         first = self.n_free + segment * self.n_nodes
@@ -196,8 +201,7 @@ class Problem:
         Raises TimeIsUpError where the time of ``containment.limited`` is over.
         """
         values = self.values(unknowns)
-        mean, std = self.prior()
-        cost = 0.5 * float(np.sum(((unknowns - mean) / std) ** 2))
+        cost = self.prior_cost(unknowns)
         trajectories, predicted = [], []
         for i, segment in enumerate(self.segments):
             check_time()

@@ -176,10 +176,10 @@ def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place])
 
 
 def _cost_of_explaining(simple: Trial, found: Trial, least: float) -> float:
-    """Return the cost above which nothing explains as much of what a simpler trial leaves as :func:`explained` is asked for.
+    """Return the cost of the readings above which no effect explains as much of what a simpler trial leaves as is asked for.
 
     Gradients can take no more from what an effect leaves than their share, and a sensor's noise counts up to ``LARGEST_NOISE``
-    times what costs are weighed by. What parameters cost that go against their priors is a part of no bound: it is small.
+    times what costs are weighed by.
     """
     share = found.share_of_gradients()
     if share >= 1.0:
