@@ -105,7 +105,8 @@ def close_loop(
     Raises
     ------
     TelemetryError, ModelError
-        If the telemetry cannot be used or the declared balance has no solution.
+        If the telemetry cannot be used, or the declared balance has no solution; over the hold-out alone: where nothing that is
+        found gives it one.
     """
     if not 0.0 < false_alarm_rate < 1.0:
         raise TelemetryError(f"false_alarm_rate: must be between 0 and 1, exclusive (got {false_alarm_rate:g})")
@@ -122,7 +123,7 @@ def close_loop(
         check_moments(train, moments)
         fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
         before = to_model(calibration, ())
-        declared = _predicted(before, held)
+        declared, lost = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         base, every = searched(whole)
         found = search(
@@ -136,6 +137,8 @@ def close_loop(
         progress(0.88, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
         is_corrected = after is not before
+        if lost is not None and not is_corrected:
+            raise lost
         before = _stated(before, found, found.base, latest)
         after = _stated(after, found, found.trial, latest) if is_corrected else before
         predictions = (declared, predicted)
@@ -144,8 +147,8 @@ def close_loop(
         missing = smooth_missing_heat(found, deadline=latest)
         report |= added_to_report(missing, report)
         report |= told_mistakes(found, report, deadline=latest)
-        driven, lost = driven_heat(found, deadline=latest)
-        report["notices"] += lost
+        driven, notices = driven_heat(found, deadline=latest)
+        report["notices"] += notices
         plots = build_plots(found, before, after, held, predictions, report, missing, driven)
         report["quality"] = quality_json([*records, *holdout_records])
         plots["quality_strip"] = quality_strip([*records, *holdout_records])
@@ -155,17 +158,14 @@ def close_loop(
         return ClosedLoop(report, after, before, plots)
 
 
-def _predicted(declared: CalibratedModel, held: Sequence[HeldOut]) -> list[Prediction]:
-    """Return what the declared model predicts.
+def _predicted(declared: CalibratedModel, held: Sequence[HeldOut]) -> tuple[list[Prediction], ModelError | None]:
+    """Return what the declared model predicts, and what is to be raised where nothing corrects it.
 
-    Raises
-    ------
-    ModelError
-        Where its balance has no solution over the hold-out: with what the training part does not tell of its parameters, which
-        inputs that rested there may bring to light.
+    It may have no solution over the hold-out because of what it lacks: parameters that stood in for that in training have run
+    away. The error tells which of them the training part leaves open.
     """
     try:
-        return [predict(declared, h) for h in held]
+        return [predict(declared, h) for h in held], None
     except ModelError as error:
         words = declared.summary["words"]
         advice = (
@@ -173,7 +173,7 @@ def _predicted(declared: CalibratedModel, held: Sequence[HeldOut]) -> list[Predi
             if words
             else ""
         )
-        raise ModelError(f"{error}{advice}") from error
+        return [predict(declared, h, holding=True) for h in held], ModelError(f"{error}{advice}")
 
 
 def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[CalibratedModel, list[Prediction]] | None:

@@ -1,7 +1,7 @@
 """The hold-out: an open-loop rollout from one initial state, never corrected, that no choice has seen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from twin_core.errors import ModelError, TelemetryError
 from twin_core.network.dynamics import reading_offsets_K
 from twin_core.simulate.extrapolation import extrapolations, in_words
 from twin_core.simulate.forcing import build_forcing
-from twin_core.simulate.rollout import rollout
+from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
 
 DEFAULT_BURN_IN_SHARE = 0.05
@@ -123,25 +123,44 @@ class Prediction:
     notices: tuple[str, ...] = ()
 
 
-def predict(model: CalibratedModel, held: HeldOut) -> Prediction:
+def predict(model: CalibratedModel, held: HeldOut, *, holding: bool = False) -> Prediction:
     """Roll a model out over a hold-out stretch from the state filtered at the end of its lead.
+
+    Parameters
+    ----------
+    model, held
+    holding
+        Where the balance has no solution, hold the last temperatures that are one to the end of the stretch, and say so.
 
     Raises
     ------
     ModelError
-        If the balance has no solution there: an error over the rest alone would look better than the model is.
+        Without ``holding``, if the balance has no solution there: an error over the rest alone would look better than the
+        model is.
     """
     network = model.network()
     values = network.parameters.values
     state = assimilate(model, held.lead).mean_K
     forcing = build_forcing(network, held.scored, model.max_step_s)
     path = rollout(network, values, state, forcing)
+    lost: tuple[str, ...] = ()
     if not path.converged:
-        raise ModelError(
-            f"{held.scored.name}: the heat balance has no solution over the hold-out; check its inputs and boundaries"
-        )
+        none = f"{held.scored.name}: the heat balance has no solution over the hold-out"
+        if not holding:
+            raise ModelError(f"{none}; check its inputs and boundaries")
+        path, n_solved = _held_on(path)
+        share = n_solved / forcing.n_steps
+        lost = (f"{none} beyond {share:.0%} of it: the temperatures there stand for the rest in the error before",)
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
     read += reading_offsets_K(network, values, held.scored.clock_s)
     measured = measured_temperatures(model.spec, held.scored)
     notices = in_words(extrapolations(network, model.effects, forcing, path))
-    return Prediction(held.scored.time_s[1:], measured[1:], read[1:], notices)
+    return Prediction(held.scored.time_s[1:], measured[1:], read[1:], (*lost, *notices))
+
+
+def _held_on(path: Rollout) -> tuple[Rollout, int]:
+    """Return a trajectory whose last solved temperatures last to its end, and the number of steps that are solved."""
+    n_solved = int(np.isfinite(path.stages_K).all(axis=(1, 2)).cumprod().sum())
+    stages = path.stages_K.copy()
+    stages[n_solved:] = stages[n_solved - 1, 1] if n_solved else path.start_K
+    return replace(path, stages_K=stages), n_solved

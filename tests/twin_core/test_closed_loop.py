@@ -1,10 +1,10 @@
 """The closed loop on spacecraft that SciPy simulated: it finds what is missing, and nothing where nothing is."""
 
 import json
+import re
 from dataclasses import dataclass, replace
 from functools import cache
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +13,12 @@ from benchmarks.case import Case
 from benchmarks.network_cases import network_case
 from twin_core import closed_loop
 from twin_core.calibrate.result import CalibratedModel
+from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
 from twin_core.closed_loop import ClosedLoop, close_loop
 from twin_core.effects import REGISTRY
 from twin_core.errors import Cancelled, ModelError, TelemetryError
-from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in
+from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -127,16 +129,33 @@ def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.M
     assert any("no solution over the hold-out" in reason for reason in report["failures"])
 
 
-def test_a_declared_model_that_cannot_predict_says_what_the_record_leaves_open() -> None:
-    """A heater that rests in training and runs afterwards: the fit may have shrunk what it heats to nothing."""
-    words = ["the data do not determine C:b; it ended 91 times below its guess"]
-
-    def fails(model: Any, held: HeldOut) -> Prediction:
+def without_a_declared_solution(model: CalibratedModel, held: HeldOut, *, holding: bool = False) -> Prediction:
+    if not model.effects and not holding:
         raise ModelError("b.csv: the heat balance has no solution over the hold-out")
+    return predict(model, held)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(ModelError, match=r"no solution.*C:b.*a value or bounds"):
-        patch.setattr(closed_loop, "predict", fails)
-        closed_loop._predicted(SimpleNamespace(summary={"words": words}), [cast(HeldOut, None)])  # type: ignore[arg-type]
+
+def test_a_declared_model_that_cannot_predict_says_what_the_record_leaves_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A heater that rests in training and runs afterwards: the fit may have shrunk what it heats to nothing."""
+    monkeypatch.setattr(closed_loop, "predict", without_a_declared_solution)
+    case = small_case("leak_to_boundary", CASES["leak_to_boundary"])
+    _, calibration = fit_network(case.spec, split_fraction([case.record], 0.3)[0])
+    model = to_model(calibration, ())
+    open_words = model.summary | {"words": ["the data do not determine C:b; it ended 91 times below its guess"]}
+    _, lost = closed_loop._predicted(replace(model, summary=open_words), split_fraction([case.record], 0.3)[1])
+    assert lost is not None and re.search(r"no solution.*C:b.*a value or bounds", str(lost))
+
+
+def test_a_declared_model_that_cannot_predict_ends_a_run_where_nothing_corrects_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(closed_loop, "predict", without_a_declared_solution)
+    case = small_case("leak_to_boundary", CASES["leak_to_boundary"])
+    found = close_loop(case.spec, [case.record]).report
+    assert [f["effect"] for f in found["findings"]] == ["leak_to_boundary"]
+    assert found["after"]["rmse_K"] < found["before"]["rmse_K"]
+    with pytest.raises(ModelError, match="no solution over the hold-out"):
+        close_loop(case.spec, [case.record], deadline_s=1e-3)  # which leaves no time to find anything
 
 
 def check_score(score: dict[str, Any], sensors: tuple[str, ...]) -> None:

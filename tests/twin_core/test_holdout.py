@@ -155,6 +155,12 @@ def test_a_prediction_without_a_solution_is_refused_not_scored_in_part() -> None
     impossible = HeldOut(held.lead, Record(held.scored.time_s, {**held.scored.values, "Q": drained}))
     with pytest.raises(ModelError, match="no solution over the hold-out"):
         predict(wall_model(), impossible)
+    held_on, possible = predict(wall_model(), impossible, holding=True), predict(wall_model(), held)
+    np.testing.assert_allclose(
+        held_on.predicted_K[:39], possible.predicted_K[:39]
+    )  # the input ramps to its fall from 39 on
+    assert (held_on.predicted_K[40:] == held_on.predicted_K[40]).all()
+    assert any("no solution over the hold-out beyond" in notice for notice in held_on.notices)
 
 
 def test_the_start_sample_and_excluded_intervals_are_not_scored() -> None:

@@ -298,7 +298,7 @@ def build_report(
             *_left_out(search),
             *_thinned(search),
             *dict.fromkeys([*before.summary["notices"], *(notice for h in held for notice in h.scored.notices)]),
-            *(notice for p in predictions[1] for notice in p.notices),
+            *dict.fromkeys(notice for stretches in predictions for p in stretches for notice in p.notices),
         ],
     }
 
