@@ -20,6 +20,7 @@ from twin_core.calibrate.undeclared.model import (
     log_likelihood,
     parameter_columns,
 )
+from twin_core.calibrate.undeclared.size import SizeSearch
 from twin_core.latent_force.held import grid_of
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
@@ -233,3 +234,17 @@ def test_a_fit_to_other_readings_takes_over_none_of_their_pattern() -> None:
     (nominal,) = fit.nominals
     afresh = grid_of(segment.forcing.step_s, nominal.sample_of, fewer.segments[0].valid)
     np.testing.assert_array_equal(nominal.grid.interval, afresh.interval)
+
+
+@pytest.mark.parametrize("curvature", [1e-3, 1.0, 1e4])
+def test_what_a_search_of_sizes_remembers_wrongly_does_not_hold_it_up(curvature: float) -> None:
+    """The heat was far larger or smaller when the slope's change was seen: passes come to the same sizes all the same."""
+    problem, _ = three_nodes(2, 20.0)
+    fit = fit_with_undeclared_heat(problem)
+    sizes = SizeSearch(0.1, curvature * np.eye(3))
+    found = replace(fit.undeclared, std_W=5.0 * fit.undeclared.std_W)
+    value = -np.inf
+    for _ in range(12):
+        before, (found, value) = value, sizes.improve(problem, found, fit.nominals)
+        assert value >= before
+    assert value > fit.log_likelihood - 0.2

@@ -156,7 +156,8 @@ def fit_with_undeclared_heat(
     values = parameters.to_values(free)
     if near is not None:
         nominals, undeclared = _carried_over(problem, values, near)
-        sizes = SizeSearch(FIRST_LOG_STEP)
+        same = problem.n_nodes == near.problem.n_nodes
+        sizes = SizeSearch(FIRST_LOG_STEP, near.size_curvature if same else None)
         return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
@@ -216,14 +217,14 @@ def _pass(
 ) -> HeatFit:
     """Relinearise about smoothed temperatures where asked, improve parameters but for ``still``, then the heat's size."""
     check_time()
-    problem, nominals = fit.problem, fit.nominals
+    problem = fit.problem
     if smoothing:
-        nominals = _smoothing_pass(problem, fit.values, fit.undeclared, nominals)
-    free, undeclared = fit.free, fit.undeclared
-    if not still:
-        free, undeclared, nominals = _improve(problem, free, undeclared, nominals, most_std)
+        fit = replace(fit, nominals=_smoothing_pass(problem, fit.values, fit.undeclared, fit.nominals))
+    if smoothing or not np.isfinite(fit.log_likelihood):
+        fit = replace(fit, log_likelihood=log_likelihood(problem, fit.undeclared, fit.nominals))
+    free, undeclared, nominals = (fit.free, fit.undeclared, fit.nominals) if still else _improve(fit, most_std)
     undeclared, value = sizes.improve(problem, undeclared, nominals)
-    return HeatFit(problem, free, undeclared, nominals, value)
+    return HeatFit(problem, free, undeclared, nominals, value, sizes.curvature)
 
 
 def with_capacities(
@@ -238,30 +239,31 @@ def with_capacities(
     return replace(undeclared, std_W=undeclared.std_W * after[index] / before[index])
 
 
-def _improve(
-    problem: Problem, free: FloatArray, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], most_std: float
-) -> tuple[FloatArray, UndeclaredHeat, tuple[Nominal, ...]]:
+def _improve(fit: HeatFit, most_std: float) -> tuple[FloatArray, UndeclaredHeat, tuple[Nominal, ...]]:
     """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
+    problem, free, undeclared, nominals = fit.problem, fit.free, fit.undeclared, fit.nominals
     parameters, std = problem.network.parameters, tightened_prior_std(problem, most_std)
-    now = parameters.to_values(free)
 
-    def posterior(at: FloatArray, size: UndeclaredHeat, about: Sequence[Nominal]) -> float:
-        return log_likelihood(problem, size, about) - 0.5 * float((((at - parameters.free) / std) ** 2).sum())
+    def log_prior(at: FloatArray) -> float:
+        return -0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
-    before = posterior(free, undeclared, nominals)
+    before = fit.log_likelihood + log_prior(free)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
         step, hessian = gauss_newton_step(problem, free, undeclared, nominals, most_std)
         if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
-            return free, undeclared, tuple(nominals)
+            return free, undeclared, nominals
     for share in STEP_SHARES:
         trial = free + share * step
         values = parameters.to_values(trial)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
-            size, about = with_capacities(problem, undeclared, now, values), _relinearised(problem, values, nominals)
-            better = posterior(trial, size, about) > before
+            size, about = (
+                with_capacities(problem, undeclared, fit.values, values),
+                _relinearised(problem, values, nominals),
+            )
+            better = log_likelihood(problem, size, about) + log_prior(trial) > before
         if better:
             return trial, size, about
-    return free, undeclared, tuple(nominals)
+    return free, undeclared, nominals
 
 
 def _carried_over(problem: Problem, values: FloatArray, near: HeatFit) -> tuple[tuple[Nominal, ...], UndeclaredHeat]:

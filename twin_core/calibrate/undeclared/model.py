@@ -90,6 +90,8 @@ class HeatFit:
         The linearisation, one per segment.
     log_likelihood
         Of the readings.
+    size_curvature : (n_nodes, n_nodes)
+        That of the log-likelihood in ln of the sizes, negated, as far as their search has told it.
     """
 
     problem: Problem
@@ -97,6 +99,7 @@ class HeatFit:
     undeclared: UndeclaredHeat
     nominals: tuple[Nominal, ...]
     log_likelihood: float
+    size_curvature: FloatArray | None = None
 
     @property
     def network(self) -> Network:

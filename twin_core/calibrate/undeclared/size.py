@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
@@ -23,6 +22,9 @@ SMALLEST_LOG_STEP, LARGEST_LOG_STEP = 0.1, 2.5
 N_ITERATIONS = 8
 """Of one pass: parameters move in between, so that no size need be final."""
 
+STEP_SHARES = (1.0, 0.3, 0.1, 0.03)
+"""Shares of a step that are tried in turn."""
+
 LEAST_SLOPE_NATS, LEAST_GAIN_NATS = 0.03, 0.01
 """Per ln of a size, and per iteration: less is not followed. A size that no longer matters stays where it would matter again."""
 
@@ -35,18 +37,18 @@ class SizeSearch:
     ----------
     log_step
         Next change of the correlation length to be tried, in ln.
+    curvature : (n_nodes, n_nodes)
+        Of the log-likelihood in ln of the sizes, negated: what the passes so far have told of it.
     """
 
     log_step: float
+    curvature: FloatArray | None = None
 
     def improve(
         self, problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
     ) -> tuple[UndeclaredHeat, float]:
-        """Return a more likely size of the undeclared heat, and its log-likelihood.
-
-        Sizes follow by a quasi-Newton method (L-BFGS-B; Byrd, Lu, Nocedal and Zhu 1995) on the exact slope of the likelihood.
-        """
-        best, value = _along_the_slope(problem, undeclared, nominals)
+        """Return a more likely size of the undeclared heat, and its log-likelihood."""
+        best, value = self._along_the_slope(problem, undeclared, nominals)
         moved = False
         for sign in (-1.0, 1.0):
             check_time()
@@ -58,36 +60,49 @@ class SizeSearch:
         self.log_step = float(np.clip(self.log_step * (1.4 if moved else 0.5), SMALLEST_LOG_STEP, LARGEST_LOG_STEP))
         return best, value
 
+    def _along_the_slope(
+        self, problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
+    ) -> tuple[UndeclaredHeat, float]:
+        """Return more likely sizes, and their log-likelihood.
 
-def _along_the_slope(
-    problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal]
-) -> tuple[UndeclaredHeat, float]:
-    """Return more likely sizes, and their log-likelihood."""
-    still = np.zeros(undeclared.std_W.size)
-    best = undeclared, -np.inf
+        Sizes follow by a quasi-Newton method (BFGS; Nocedal and Wright 2006, section 6.1) on the exact slope of the likelihood.
+        It remembers from pass to pass how the slope changes, so that most take a step or none.
+        """
+        value, slope = log_likelihood_and_slope(problem, undeclared, nominals)
+        if self.curvature is None:
+            self.curvature = np.diag(np.maximum(np.abs(slope), 1.0))
+        moved = np.zeros(slope.size)
+        for iteration in range(N_ITERATIONS):
+            step = np.linalg.solve(self.curvature, slope)
+            step = np.clip(moved + step, -LARGEST_LOG_STEP, LARGEST_LOG_STEP) - moved
+            promised = 0.5 * float(slope @ step)  # believed of a curvature that this pass has seen
+            if np.abs(slope).max() < LEAST_SLOPE_NATS or (iteration > 0 and promised < LEAST_GAIN_NATS):
+                break
+            before = value
+            for share in STEP_SHARES:
+                check_time()
+                trial = replace(undeclared, std_W=undeclared.std_W * np.exp(share * step))
+                found, slope_there = log_likelihood_and_slope(problem, trial, nominals)
+                if np.isfinite(found):
+                    self.curvature = _updated(self.curvature, np.asarray(share * step), slope - slope_there)
+                if found > value:
+                    undeclared, value, slope, moved = trial, found, slope_there, moved + share * step
+                    break
+            if not value - before > LEAST_GAIN_NATS:
+                break
+        return undeclared, value
 
-    def cost(moved: FloatArray) -> tuple[float, FloatArray]:
-        nonlocal best
-        check_time()
-        trial = replace(undeclared, std_W=undeclared.std_W * np.exp(moved))
-        value, slope = log_likelihood_and_slope(problem, trial, nominals)
-        best = max(best, (trial, value), key=lambda tried: tried[1])
-        return (-value, -slope) if np.isfinite(value) else (1e300, still)
 
-    value, _ = cost(still)
-    minimize(
-        cost,
-        still,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(-LARGEST_LOG_STEP, LARGEST_LOG_STEP)] * still.size,
-        options={
-            "maxiter": N_ITERATIONS,
-            "gtol": LEAST_SLOPE_NATS,
-            "ftol": LEAST_GAIN_NATS / max(abs(value), 1.0),
-        },
-    )
-    return best
+def _updated(curvature: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
+    """Return a positive curvature that tells how the slope changed along a step, as far as it may (Powell's damping)."""
+    along = curvature @ step
+    expected, seen = float(step @ along), float(step @ change)
+    if not expected > 0.0:
+        return curvature
+    if seen < 0.2 * expected:
+        share = 0.8 * expected / (expected - seen)
+        change = share * change + (1.0 - share) * along
+    return np.asarray(curvature - np.outer(along, along) / expected + np.outer(change, change) / float(step @ change))
 
 
 def _with_length(undeclared: UndeclaredHeat, log_step: float, nominals: Sequence[Nominal]) -> UndeclaredHeat:
