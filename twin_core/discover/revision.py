@@ -84,7 +84,7 @@ def _alone(
     others = frozenset(effect.place for finding in state.findings for effect in finding.effects) - places
     if not others:
         return state.base, state.trial
-    kept = _attempted_without(state, others)
+    kept = attempted_without(state, others)
     return None if kept is None else (state.base, kept[0])
 
 
@@ -93,7 +93,7 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
 
     Error on what it was not fitted to, after over before, is enough below ``foresight`` too.
     """
-    without = _attempted_without(state, places)
+    without = attempted_without(state, places)
     finding = next(f for f in state.findings if f.judged.places == places)
     if without is None:
         return
@@ -119,7 +119,7 @@ def _in_place_of(
     ``foresight`` times that of the finding.
     """
     places = finding.judged.places
-    kept = _attempted_without(state, places)
+    kept = attempted_without(state, places)
     if kept is None:
         return False
     without, lost = kept
@@ -151,7 +151,7 @@ def prune(state: Search, needed: float) -> None:
         for effect in finding.effects:
             if all(other.place == effect.place for other in state.trial.effects):
                 continue
-            kept = _attempted_without(state, {effect.place})
+            kept = attempted_without(state, {effect.place})
             if kept is not None and (kept[1] <= needed or _explains_nothing(kept[0], state.trial)):
                 _drop(state, {effect.place}, *kept)
                 rest.discard(effect.place)
@@ -214,7 +214,7 @@ def _is_better(name: Finding, heat: Finding) -> bool:
 def tell_alternatives(state: Search, needed: float) -> None:
     """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more."""
     for i, finding in enumerate(state.findings):
-        kept = _attempted_without(state, finding.judged.places)
+        kept = attempted_without(state, finding.judged.places)
         if kept is None:
             continue
         compared = state.attempt(
@@ -254,7 +254,7 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
             return
 
 
-def _attempted_without(state: Search, places: Collection[object]) -> Without | None:
+def attempted_without(state: Search, places: Collection[object]) -> Without | None:
     """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed.
 
     It is asked for again and again, of the same trial: once is enough.

@@ -15,6 +15,7 @@ from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.complete import complete
 from twin_core.discover.evidence import Evidence, weigh
+from twin_core.discover.exchange import exchange
 from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
@@ -23,6 +24,7 @@ from twin_core.discover.judge import (
     Judged,
     Search,
     accept,
+    is_close,
     once_each,
     threshold,
     worth,
@@ -66,6 +68,9 @@ N_FIRST = 2
 
 UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED)
 """Why a single effect may be refused that is seen only beside another one."""
+
+N_UNSEEN = 2
+"""Effects refused so that are extended by another one, where the data hardly tell them apart."""
 
 
 def search(
@@ -114,6 +119,7 @@ def search(
         complete(state, needed)
         _converge(state)
         prune(state, needed)
+        exchange(state, needed)
         if _places(state) == known:
             break  # what was found does not hold: the next step would find it again
     withdraw(state, needed)
@@ -210,13 +216,13 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
 
 
 def _unseen_by_trajectories(refused: Sequence[Judged]) -> list[Trial]:
-    """Return the likeliest single effect that was refused for what it does to trajectories, if any.
+    """Return the likeliest single effects that were refused for what they do to trajectories, those that data hardly tell apart.
 
     A lagging sensor, say, shows between neighbouring readings and changes no long trajectory; what does may show beside it only.
     Nor is the size of an effect determined where the model's parameters follow another one that is missing too.
     """
-    singles = [j for j in refused if j.reason in UNSEEN and len(j.effects) == 1]
-    return [min(singles, key=worth).trial] if singles else []
+    singles = sorted((j for j in refused if j.reason in UNSEEN and len(j.effects) == 1), key=worth)
+    return [j.trial for j in singles[:N_UNSEEN] if j is singles[0] or is_close(j, singles[0])]
 
 
 def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bool, list[list[Probe]]]:
