@@ -399,7 +399,7 @@ def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
     option = Judged((mix,), Evidence(nats, 0.0), stub(mix))
     told = Finding(found, (option, other))
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 60.0))
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 60.0))
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
     monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
@@ -430,7 +430,7 @@ def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
     found = Judged((mix,), Evidence(90.0, 0.0), stub(mix, n_free=5))
     told = Finding(found, (judged("a", 90.0 - behind), judged("b", 10.0)))
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 90.0))
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
     monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
@@ -448,7 +448,7 @@ def test_the_simplest_of_the_names_that_cannot_be_told_apart_leads(
 def test_the_likeliest_of_those_as_simple_leads(monkeypatch: pytest.MonkeyPatch, ahead: float, leads: str) -> None:
     found, told = judged("a", 90.0), Finding(judged("a", 90.0), (judged("b", 90.0 + ahead),))
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 90.0))
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(90.0 + ahead, 0.0))
     monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (judged, False))
@@ -471,7 +471,7 @@ def test_of_names_alike_the_one_leads_that_leaves_less_and_predicts_better(
     told = Finding(found, (option,))
     trials = {"b": option.trial}
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 90.0))
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: trials[effects[0].where["node"]])
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(40.0, 0.0))
     monkeypatch.setattr(
@@ -489,7 +489,7 @@ def test_one_with_more_freedom_leaves_less_and_does_not_lead_for_it(monkeypatch:
     option = Judged((freer,), Evidence(89.0, 0.0), stub(freer, left=1.0, foresight=0.1))
     told = Finding(judged("a", 90.0), (option,))
     monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: told)
-    monkeypatch.setattr(revision, "_attempted_without", lambda state, places: (stub(), 90.0))
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 90.0))
     state = Search(stub(load("a"), left=2.0, foresight=0.9), stub(), findings=[Finding(judged("a", 90.0))])
     tell_alternatives(state, NEEDED)
     assert state.findings == [told]
