@@ -150,7 +150,7 @@ def predict(model: CalibratedModel, held: HeldOut, *, holding: bool = False) -> 
             raise ModelError(f"{none}; check its inputs and boundaries")
         path, n_solved = _held_on(path)
         share = n_solved / forcing.n_steps
-        lost = (f"{none} beyond {share:.0%} of it: the temperatures there stand for the rest in the error before",)
+        lost = (f"{none} beyond {share:.0%} of it; from there on the last temperatures are held",)
     read = path.at_samples(forcing.sample_step)[:, network.sensor_node]
     read += reading_offsets_K(network, values, held.scored.clock_s)
     measured = measured_temperatures(model.spec, held.scored)

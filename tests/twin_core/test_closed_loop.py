@@ -132,7 +132,7 @@ def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.M
 def without_a_declared_solution(model: CalibratedModel, held: HeldOut, *, holding: bool = False) -> Prediction:
     if not model.effects and not holding:
         raise ModelError("b.csv: the heat balance has no solution over the hold-out")
-    return predict(model, held)
+    return replace(predict(model, held), notices=("the last temperatures are held",) if holding else ())
 
 
 def test_a_declared_model_that_cannot_predict_says_what_the_record_leaves_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +154,7 @@ def test_a_declared_model_that_cannot_predict_ends_a_run_where_nothing_corrects_
     found = close_loop(case.spec, [case.record]).report
     assert [f["effect"] for f in found["findings"]] == ["leak_to_boundary"]
     assert found["after"]["rmse_K"] < found["before"]["rmse_K"]
+    assert found["notices"].count("the last temperatures are held") == 1
     with pytest.raises(ModelError, match="no solution over the hold-out"):
         close_loop(case.spec, [case.record], deadline_s=1e-3)  # which leaves no time to find anything
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import BFGS
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.containment import check_time
@@ -95,14 +96,12 @@ class SizeSearch:
 
 def _updated(curvature: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
     """Return a positive curvature that tells how the slope changed along a step, as far as it may (Powell's damping)."""
-    along = curvature @ step
-    expected, seen = float(step @ along), float(step @ change)
-    if not expected > 0.0:
+    if not change.any():
         return curvature
-    if seen < 0.2 * expected:
-        share = 0.8 * expected / (expected - seen)
-        change = share * change + (1.0 - share) * along
-    return np.asarray(curvature - np.outer(along, along) / expected + np.outer(change, change) / float(step @ change))
+    known = BFGS(exception_strategy="damp_update", init_scale=curvature if step.size > 1 else curvature.item())
+    known.initialize(step.size, "hess")
+    known.update(step, change)
+    return np.asarray(known.get_matrix())
 
 
 def _with_length(undeclared: UndeclaredHeat, log_step: float, nominals: Sequence[Nominal]) -> UndeclaredHeat:
