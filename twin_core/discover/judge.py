@@ -215,24 +215,25 @@ def accept(state: Search, options: Sequence[Judged], needed: float) -> bool:
     weak = [replace(j, reason=NOT_SUPPORTED) for j in judged if j.evidence.log_bayes_factor <= needed]
     refused: list[Judged] = []
     passed: list[Judged] = []
-    unlike: list[Trial] = []
+    unlike: list[Judged] = []
     likely = [j for j in judged if j.evidence.log_bayes_factor > needed]
     with _examined(state, likely, needed) as examined:
         for i, best in enumerate(likely):
             if sum(j.validation is not None for j in refused) + len(passed) >= N_VALIDATED:
                 break
-            if unlike:
+            same_heat = [r for r in unlike if acts_at(r.trial, r.effects) == acts_at(best.trial, best.effects)]
+            if same_heat:
                 left = state.attempt(best.trial.unexplained, best.labels)
                 if left is None:
                     refused.append(replace(best, reason=NOT_EXAMINED))
                 more_than_chance = by_chance(best.trial.n_samples)
-                if left is None or any(left + more_than_chance >= trial.unexplained() for trial in unlike):
-                    continue  # what explains no more is no better a name for this heat
+                if left is None or any(left + more_than_chance >= r.trial.unexplained() for r in same_heat):
+                    continue  # what explains no more where it acts is no better a name for this heat
             own, resembles = examined(i)
             if own.reason:
                 refused.append(own)
                 if resembles:
-                    unlike.append(own.trial)
+                    unlike.append(own)
             else:
                 passed.append(own)
                 if is_free or stands(state.trial, own.trial):

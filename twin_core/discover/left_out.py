@@ -10,7 +10,7 @@ from twin_core._typing import BoolArray, FloatArray
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Fit, Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.second_order import Calibration
+from twin_core.calibrate.second_order import Calibration, sampling_step_s
 
 N_BLOCKS = 8
 """Blocks of the training record that are predicted from the others."""
@@ -74,15 +74,30 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
 
 
 def _predicted(calibration: Calibration, out: BoolArray) -> float:
-    """Return the error on rows (n_rows, 1) of all segments by a refit to the others; infinite where it fails."""
+    """Return the error on rows (n_rows, 1) of all segments by a refit to the others; infinite where it fails.
+
+    A coarse model leaves a misfit that lasts: counted sample by sample, what is left would seem to tell what it does not, and
+    carry far away what only the whole record determines. So every reading counts for as much as it does in the long run.
+    """
     problem, optimum = calibration.problem, calibration.optimum
     edges = np.cumsum([segment.measured_K.shape[0] for segment in problem.segments])[:-1]
     kept = tuple(
         replace(segment, measured_K=np.where(rows, np.nan, segment.measured_K))
         for segment, rows in zip(problem.segments, np.split(out, edges), strict=True)
     )
-    refit = minimise(replace(problem, segments=kept), optimum.unknowns, near=optimum.fit)
+    refit = minimise(
+        replace(problem, segments=kept, noise_K=_lasting_noise_K(calibration)), optimum.unknowns, near=optimum.fit
+    )
     return np.inf if refit.status == "no_solution" else _error(problem, refit.fit, out)
+
+
+def _lasting_noise_K(calibration: Calibration) -> FloatArray:
+    """Return the noise of each sensor that its residual amounts to in the long run, no less than its own, (n_sensors,)."""
+    problem, whitener = calibration.problem, calibration.whitener
+    interval_s = sampling_step_s([segment.record for segment in problem.segments])
+    n_valid = whitener.valid.sum(axis=0).tolist()
+    lasting = [model.lasting(interval_s, n) for model, n in zip(whitener.models, n_valid, strict=True)]
+    return np.maximum(problem.noise_K, lasting)
 
 
 def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:

@@ -50,6 +50,15 @@ class ResidualNoise:
         """Return the standard deviation of what the coloured part one interval earlier does not tell of the residual."""
         return float(np.sqrt(self.sigma_white**2 - self.sigma_ou**2 * np.expm1(-2.0 * interval_s / self.length_s)))
 
+    def lasting(self, interval_s: float, n_samples: int) -> float:
+        """Return the standard deviation of white noise that would tell as little of what does not change from sample to sample.
+
+        The variance of a mean of many samples, times their number: sigma_white² + sigma_ou² coth(interval / 2 length); that of
+        ``n_samples`` of them is at most that of a coloured part that never changes.
+        """
+        together = min(1.0 / np.tanh(0.5 * interval_s / self.length_s), float(n_samples))
+        return float(np.sqrt(self.sigma_white**2 + self.sigma_ou**2 * together))
+
     def whiten(self, time_s: FloatArray, columns: FloatArray, valid: BoolArray) -> tuple[FloatArray, float]:
         """Apply L⁻¹ to columns, L Lᵀ being this noise's covariance at the valid samples.
 

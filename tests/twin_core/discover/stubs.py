@@ -1,6 +1,6 @@
 """Stubs of trials and findings of which only what decides counts."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -56,6 +56,7 @@ class Problem:
 @dataclass
 class Fit:
     problem: Problem
+    network: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(layout=None))
 
 
 @dataclass
@@ -106,3 +107,10 @@ def judged(node: str, nats: float, *, n_free: int = 3, left: float = 0.0, foresi
     return Judged(
         (load(node),), Evidence(nats, 0.0), stub(load(node), left=left, n_free=n_free, foresight=foresight), validation
     )
+
+
+def leak(judged_load: Judged) -> Judged:
+    """Return an option with a leak at the node of its load."""
+    node = judged_load.effects[0].where["node"]
+    effect = REGISTRY["leak_to_boundary"]({"node": node, "boundary": "room"}, {"G_W_per_K": 1.0})
+    return replace(judged_load, effects=(effect,))

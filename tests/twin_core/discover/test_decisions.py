@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.twin_core.discover.stubs import CHANCE, JUST, LEAST, MOST, NEEDED, Problem, Stub, judged, load, stub
+from tests.twin_core.discover.stubs import CHANCE, JUST, LEAST, MOST, NEEDED, Problem, Stub, judged, leak, load, stub
 from twin_core.discover import coarseness, judge, policy, trajectories
 from twin_core.discover import search as searching
 from twin_core.discover.coarseness import least_explained, stands
@@ -136,7 +136,7 @@ def test_every_set_of_effects_counts_once_at_its_best() -> None:
 
 @pytest.fixture
 def examined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take the foresight of an option as it stands, one at node ``form`` for no law, and one at ``x…`` for less likely."""
+    """Take the foresight of an option as it stands, a load at node ``form`` for no law, and one at ``x…`` for less likely."""
 
     def told(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
         assert option.validation is not None
@@ -144,7 +144,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
             return replace(option, validation=None, reason=LESS_LIKELY), False
         if not option.validation.foresight < FORESIGHT:
             return replace(option, reason=NO_FORESIGHT), False
-        is_form = option.effects[0].where["node"] == "form"
+        is_form = option.effects[0].place == load("form").place
         return replace(option, reason=NO_LAW if is_form else ""), is_form
 
     monkeypatch.setattr(judge, "examine", told)
@@ -160,9 +160,10 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         ([judged("a", 90.0, foresight=FORESIGHT - JUST)], "a", []),
         ([judged("a", 90.0, foresight=0.99), judged("b", 60.0)], "b", [NO_FORESIGHT]),
         ([judged("a", 90.0), judged("b", 60.0)], "a", []),
-        ([judged("form", 90.0), judged("b", 60.0)], None, [NO_LAW]),
-        ([judged("form", 90.0, left=CHANCE + JUST), judged("b", 60.0)], "b", [NO_LAW]),
-        ([judged("form", 90.0, left=CHANCE - JUST), judged("b", 60.0)], None, [NO_LAW]),
+        ([judged("form", 90.0), judged("b", 60.0)], "b", [NO_LAW]),
+        ([judged("form", 90.0), leak(judged("form", 60.0))], None, [NO_LAW]),
+        ([judged("form", 90.0, left=CHANCE + JUST), leak(judged("form", 60.0))], "form", [NO_LAW]),
+        ([judged("form", 90.0, left=CHANCE - JUST), leak(judged("form", 60.0))], None, [NO_LAW]),
         ([judged("form", 90.0), judged("b", 3.0)], None, [NO_LAW, NOT_SUPPORTED]),
         ([*(judged(f"x{i}", 90.0 - i) for i in range(5)), judged("b", 60.0)], "b", [LESS_LIKELY] * 5),
         ([*(judged(f"a{i}", 90.0 - i, foresight=1.0) for i in range(8)), judged("b", 60.0)], None, [NO_FORESIGHT] * 8),
@@ -174,6 +175,7 @@ def examined(monkeypatch: pytest.MonkeyPatch) -> None:
         "hardly better",
         "the next",
         "the likeliest",
+        "no law there, but elsewhere",
         "no law",
         "explains more than what is no law",
         "explains more by chance alone",
@@ -196,7 +198,7 @@ def test_an_option_that_cannot_be_computed_ends_no_choice() -> None:
     def fails() -> Any:
         raise np.linalg.LinAlgError("no number")
 
-    option = judged("b", 60.0)
+    option = leak(judged("form", 60.0))
     option.trial.excess = fails  # type: ignore[method-assign]
     state = Search(stub(left=9.0), stub(left=9.0))
     accept(state, [judged("form", 90.0, left=1.0), option, judged("c", 50.0)], NEEDED)

@@ -11,7 +11,7 @@ from twin_core._typing import FloatArray
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.discover import left_out
-from twin_core.discover.left_out import N_BLOCKS, OPENING_SHARE, blocked_errors
+from twin_core.discover.left_out import N_BLOCKS, OPENING_SHARE, blocked_errors, forward_error
 from twin_core.network.spec_io import load_spec
 from twin_core.parameters.transforms import Log
 from twin_core.parameters.vector import ParameterSet
@@ -42,14 +42,14 @@ def swinging() -> FloatArray:
     return 10.0 + 8.0 * np.sin(2.0 * np.pi * TIME_S / 600.0)
 
 
-def calibrated(power_W: FloatArray) -> Calibration:
-    """Return a block that rests with its power at first, calibrated."""
+def calibrated(power_W: FloatArray, misfit_K: FloatArray | float = 0.0) -> Calibration:
+    """Return a block that rests with its power at first, calibrated to readings with a misfit."""
     capacity, conductance = 60.0, 0.8
     fade, path = np.exp(-conductance * STEP_S / capacity), [ROOM_K + power_W[0] / conductance]
     for power in power_W[:-1]:
         rest_K = ROOM_K + power / conductance
         path.append(rest_K + fade * (path[-1] - rest_K))
-    measured = np.array(path) + NOISE_K * np.random.default_rng(3).standard_normal(N)
+    measured = np.array(path) + misfit_K + NOISE_K * np.random.default_rng(3).standard_normal(N)
     _, calibration = fit_network(load_spec(SPEC), [Record(TIME_S, {"T": measured, "P": power_W}, None, "block")])
     return calibration
 
@@ -107,3 +107,24 @@ def test_a_refit_that_fails_leaves_the_linear_answer(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(left_out, "MISJUDGED", np.inf)
     assert np.isfinite(failed).all()
     np.testing.assert_array_equal(failed, blocked_errors(calibration))
+
+
+def wandering(seed: int, std_K: float, length_s: float) -> FloatArray:
+    """Return an Ornstein-Uhlenbeck misfit."""
+    rng, fade = np.random.default_rng(seed), np.exp(-STEP_S / length_s)
+    steps = np.sqrt(1.0 - fade**2) * rng.standard_normal(N)
+    path = [rng.standard_normal()]
+    for step in steps[1:]:
+        path.append(fade * path[-1] + step)
+    return std_K * np.array(path)
+
+
+def test_a_misfit_that_lasts_carries_no_refit_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The beginning tells no capacity: under a misfit that wanders it must not be taken to, for the end has the pulse."""
+    power = np.where((TIME_S >= 0.80 * TIME_S[-1]) & (TIME_S < 0.85 * TIME_S[-1]), 30.0, 10.0)
+    cases = [calibrated(power, wandering(seed, 0.4, 900.0)) for seed in range(12)]
+    own = [forward_error(case) for case in cases]
+    monkeypatch.setattr(left_out, "_lasting_noise_K", lambda calibration: calibration.problem.noise_K)
+    as_if_white = [forward_error(case) for case in cases]
+    assert np.mean(own) < np.mean(as_if_white)
+    assert np.std(np.log(own)) < np.std(np.log(as_if_white)) / 3.0

@@ -130,3 +130,11 @@ def test_what_the_coloured_part_one_interval_earlier_does_not_tell(interval_s):
     shared = noise.sigma_ou**2 * np.exp(-interval_s / noise.length_s)
     conditional = noise.sigma_ou**2 + noise.sigma_white**2 - shared**2 / noise.sigma_ou**2
     assert noise.unforeseen(interval_s) ** 2 == pytest.approx(conditional)
+
+
+@pytest.mark.parametrize(("length_s", "n", "tolerance"), [(90.0, 4000, 1e-2), (1e-3, 4000, 1e-9), (1e9, 300, 1e-4)])
+def test_what_lasts_is_the_variance_of_a_mean_times_their_number(length_s: float, n: int, tolerance: float) -> None:
+    """Of many samples, of independent ones, and of a coloured part that never changes."""
+    noise = ResidualNoise(0.3, length_s, 0.1, 0.0)
+    of_the_mean = _covariance(60.0 * np.arange(n), noise).mean()
+    assert noise.lasting(60.0, n) ** 2 == pytest.approx(n * of_the_mean, rel=tolerance)
