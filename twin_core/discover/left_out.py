@@ -36,12 +36,17 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
     At the optimum with Hessian H, leaving out block b moves the parameters by -(H - J_b' J_b)^-1 J_b' r_b, so that the
     residual on b becomes r_b + J_b (H - J_b' J_b)^-1 J_b' r_b: exact for a linear model, no refit needed. Where one block alone
     tells a parameter, it moves far: what the model predicts there is asked, and a refit where that is something else.
+    Readings count for as much as they do in the long run: a coarse model leaves a misfit that lasts, and counted sample by sample
+    what is left would seem to tell what it does not, and carry far away what only the whole record determines.
     """
     problem, unknowns = calibration.problem, calibration.optimum.unknowns
+    lasting_K = _lasting_noise_K(calibration)
     jacobian = stacked_jacobian(problem, problem.jacobian_blocks(unknowns, calibration.optimum.fit))
-    residual = np.concatenate(calibration.residuals) / problem.noise_K
-    jacobian = jacobian / problem.noise_K[None, :, None]
-    hessian = calibration.optimum.hessian
+    jacobian /= lasting_K[:, None]
+    residual = np.concatenate(calibration.residuals) / lasting_K
+    in_noise = np.broadcast_to(lasting_K / problem.noise_K, residual.shape)
+    told_by = jacobian[np.isfinite(residual)]
+    hessian = told_by.T @ told_by + np.diag(problem.prior()[1] ** -2.0)
     down, up = problem.step_bounds(unknowns)
     told = (down < 0.0) & (up > 0.0)  # what rests on a bound stays there
     # An instant is told by one block alone, and seldom moves linearly.
@@ -57,7 +62,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
         inverse = np.linalg.pinv(rest * scale[:, None] * scale, rcond=1e-10, hermitian=True)
         move = scale * (inverse @ (scale * (rows.T @ left)))
-        predicted = left + rows @ move
+        predicted = (left + rows @ move) * in_noise[first:last][valid]
         errors[b] = float(predicted @ predicted)
         moves[b, told] = -move
     if not told.all():
@@ -74,11 +79,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
 
 
 def _predicted(calibration: Calibration, out: BoolArray) -> float:
-    """Return the error on rows (n_rows, 1) of all segments by a refit to the others; infinite where it fails.
-
-    A coarse model leaves a misfit that lasts: counted sample by sample, what is left would seem to tell what it does not, and
-    carry far away what only the whole record determines. So every reading counts for as much as it does in the long run.
-    """
+    """Return the error on rows (n_rows, 1) of all segments by a refit to the others; infinite where it fails."""
     problem, optimum = calibration.problem, calibration.optimum
     edges = np.cumsum([segment.measured_K.shape[0] for segment in problem.segments])[:-1]
     kept = tuple(

@@ -116,7 +116,7 @@ def wandering(seed: int, std_K: float, length_s: float) -> FloatArray:
     path = [rng.standard_normal()]
     for step in steps[1:]:
         path.append(fade * path[-1] + step)
-    return std_K * np.array(path)
+    return np.asarray(std_K * np.array(path), dtype=np.float64)
 
 
 def test_a_misfit_that_lasts_carries_no_refit_away(monkeypatch: pytest.MonkeyPatch) -> None:
