@@ -42,7 +42,7 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadfile --no-loads
 test: $(STAMP)
 	$(PYTEST) -m "not long and not ground and not fleet"
 
-# The demonstration, the quick start and the operator's guide, as they are printed.
+# The demonstration, the quick start and the operator's guide, as they are printed, and searches of more than twenty seconds.
 test-long: $(STAMP)
 	$(PYTEST) -m long
 

@@ -106,6 +106,7 @@ def test_specification_example_is_valid() -> None:
         assert set(model.model_fields) <= used, f"the example shows not every field of {model.__name__}"
 
 
+@pytest.mark.long
 def test_the_latent_force_example_finds_the_missing_heat() -> None:
     """One node that leaks to a wall, at rest until 5 W are switched on: temperatures in closed form."""
     spec = load_spec(

@@ -82,7 +82,7 @@ def test_a_plugin_that_fails_on_the_way_is_blamed_and_not_the_program(
     assert capsys.readouterr().err == f"twin: {file}:{line}: AssertionError: no panel; correct the plug-in\n"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_loop_finds_a_louver_and_a_forecast_needs_its_plugin(
     desk: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

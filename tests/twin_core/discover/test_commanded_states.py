@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.closed_loop import ClosedLoop, close_loop
@@ -75,6 +76,7 @@ def solved(shaded: bool) -> ClosedLoop:
     return close_loop(load_spec(SPEC), [train], holdout_records=[later])
 
 
+@pytest.mark.long
 def test_a_position_that_shades_is_found_and_told_over_pitch() -> None:
     report = solved(True).report
     first = report["findings"][0]
@@ -102,5 +104,6 @@ def test_what_a_position_adds_is_told_within_its_uncertainty() -> None:
         assert abs(mean - expected) < 4.0 * std + 0.2 * abs(expected) + 2.0
 
 
+@pytest.mark.long
 def test_a_position_that_does_nothing_is_not_named() -> None:
     assert solved(False).report["verdict"] == "no_effect_supported"

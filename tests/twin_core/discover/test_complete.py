@@ -12,7 +12,7 @@ CAPACITY_J_PER_K, STRAP_W_PER_K, LEAK_W_PER_K, NOISE_K = np.array([4.0e3, 9.0e3]
 BEGUN_S, ENDED_S, HEAT_W = 15_030.0, 30_090.0, 9.0
 
 
-@pytest.mark.parametrize("ended_s", [ENDED_S, np.inf], ids=["ends", "stays"])
+@pytest.mark.parametrize("ended_s", [pytest.param(ENDED_S, marks=pytest.mark.long), np.inf], ids=["ends", "stays"])
 def test_a_load_that_ended_is_told_with_its_end_and_no_other_has_one(ended_s: float) -> None:
     """SciPy integrates the truth, one constant heat after the other; the last 30 % are held out."""
     time_s = np.arange(0.0, 72_000.0, 60.0)

@@ -109,6 +109,8 @@ def test_where_there_are_no_gradients_bands_stay() -> None:
     assert found is None or (found.added(plain**2) < plain**2).all()
 
 
+@pytest.mark.long
+@pytest.mark.statistical
 def test_bands_hold_the_truth_of_bodies_with_gradients() -> None:
     """Thirty bodies with sensors off their mean by Biot numbers of the size that is assumed, four parameters each."""
     rng, plain, wide = np.random.default_rng(20), [], []
