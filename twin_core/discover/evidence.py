@@ -154,13 +154,17 @@ def _last_instant(simple: Trial, rich: Trial) -> float | None:
 def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
     """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
 
+    Each model is taken at the better of its refits; where after either of them the effects predict worse, that counts once more.
     An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
     """
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
         before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
-    return float(np.sqrt(after / max(before, 1e-300))) if before > 0.0 else 1.0
+    if not before.any():
+        return 1.0
+    each = np.sqrt(after / np.maximum(before, 1e-300))
+    return float(np.sqrt(after.min() / max(before.min(), 1e-300)) * np.maximum(1.0, each.max()))
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

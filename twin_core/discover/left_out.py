@@ -73,22 +73,20 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         out[first:last] = later[first:last]
         there = _error(problem, problem.solve(unknowns + moves[b], calibration.optimum.fit), out)
         if not abs(there - errors[b]) <= enough:
-            refitted = _predicted(calibration, out)
+            refitted = _predicted(calibration, lasting_K, out)
             errors[b] = refitted if np.isfinite(refitted) else errors[b]
     return errors
 
 
-def _predicted(calibration: Calibration, out: BoolArray) -> float:
-    """Return the error on rows (n_rows, 1) of all segments by a refit to the others; infinite where it fails."""
+def _predicted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> float:
+    """Return the error on rows (n_rows, 1) of all segments by a refit to the others beside a noise; infinite where it fails."""
     problem, optimum = calibration.problem, calibration.optimum
     edges = np.cumsum([segment.measured_K.shape[0] for segment in problem.segments])[:-1]
     kept = tuple(
         replace(segment, measured_K=np.where(rows, np.nan, segment.measured_K))
         for segment, rows in zip(problem.segments, np.split(out, edges), strict=True)
     )
-    refit = minimise(
-        replace(problem, segments=kept, noise_K=_lasting_noise_K(calibration)), optimum.unknowns, near=optimum.fit
-    )
+    refit = minimise(replace(problem, segments=kept, noise_K=noise_K), optimum.unknowns, near=optimum.fit)
     return np.inf if refit.status == "no_solution" else _error(problem, refit.fit, out)
 
 
@@ -110,15 +108,22 @@ def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
     return float(np.nansum(np.where(out, left, 0.0) ** 2))
 
 
-def forward_error(calibration: Calibration, event_s: float = -np.inf) -> float:
+def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatArray:
     """Return the open-loop error over what a refit has not seen; infinite where a refit fails, zero where nothing is left.
 
     Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
     Of a single one the end is predicted by a fit to the beginning, up to a while after ``event_s`` on the clock of
     ``Record.clock_s``: nothing foretells an event that has not begun.
+
+    Returns
+    -------
+    (2,)
+        By refits beside the sensors' own noise, and beside the noise that lasts: the former may follow a misfit that wanders, the
+        latter falls back on what was guessed where readings tell little.
     """
-    folds = _folds(calibration.problem.segments, event_s)
-    return sum(_predicted(calibration, np.concatenate(fold)) for fold in folds if any(rows.any() for rows in fold))
+    folds = [np.concatenate(fold) for fold in _folds(calibration.problem.segments, event_s)]
+    noises = (calibration.problem.noise_K, _lasting_noise_K(calibration))
+    return np.array([sum(_predicted(calibration, noise_K, fold) for fold in folds if fold.any()) for noise_K in noises])
 
 
 def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]:

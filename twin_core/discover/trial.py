@@ -91,8 +91,8 @@ class Trial:
         return blocked_errors(self.calibration())
 
     @once
-    def forward_error(self) -> float:
-        """Sum of squared weighted errors over parts of the training record that a refit has not seen."""
+    def forward_error(self) -> FloatArray:
+        """Sum of squared weighted errors over parts of the training record that a refit has not seen, by two such, (2,)."""
         return forward_error(self.calibration())
 
     @once
