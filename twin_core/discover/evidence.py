@@ -116,6 +116,7 @@ def _n_instants(trial: Trial) -> int:
 def validate(simple: Trial, rich: Trial) -> Validation:
     """Return how the rich trial predicts blocks that it was not fitted to, against the simple one.
 
+    By refits beside the sensors' own noise and beside the noise that lasts; where they differ the less favourable one counts.
     Both as they are handed out, without gradients within the nodes.
     """
     misfits = [np.concatenate(t.calibration().residuals) / t.fit.problem.noise_K for t in (simple, rich)]
@@ -124,9 +125,9 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     ask_each(simple.block_errors, rich.block_errors, *foretold)
     before, after = simple.block_errors(), rich.block_errors()
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
-    ratio = max(_rms_ratio(before, after), where_fitted)
+    ratio = max(_rms_ratio(before.sum(axis=1), after.sum(axis=1)), where_fitted)
     forward = _forward_ratio(simple, rich, instant)
-    better = float(np.mean(after < before))
+    better = float(np.mean((after < before).all(axis=0)))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
@@ -134,8 +135,8 @@ def validate(simple: Trial, rich: Trial) -> Validation:
 
 
 def _rms_ratio(before: FloatArray, after: FloatArray) -> float:
-    """Return the error over all blocks, after over before (rms)."""
-    return float(np.sqrt(after.sum() / max(before.sum(), 1e-300)))
+    """Return the error on what was left out, after over before (rms), of sums of squares by several refits: the worst one."""
+    return float(np.sqrt(np.max(after / np.maximum(before, 1e-300))))
 
 
 def _last_instant(simple: Trial, rich: Trial) -> float | None:
@@ -154,17 +155,13 @@ def _last_instant(simple: Trial, rich: Trial) -> float | None:
 def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
     """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
 
-    Each model is taken at the better of its refits; where after either of them the effects predict worse, that counts once more.
     An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
     """
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
         before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
-    if not before.any():
-        return 1.0
-    each = np.sqrt(after / np.maximum(before, 1e-300))
-    return float(np.sqrt(after.min() / max(before.min(), 1e-300)) * np.maximum(1.0, each.max()))
+    return _rms_ratio(before, after) if before.any() else 1.0
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

@@ -33,18 +33,27 @@ MOST_FOLDS = 4
 def blocked_errors(calibration: Calibration) -> FloatArray:
     """Return the error on each of ``N_BLOCKS`` blocks of the record, predicted by parameters fitted to the others.
 
+    Returns
+    -------
+    (2, N_BLOCKS)
+        By fits beside the sensors' own noise, and beside the noise that lasts, as :func:`forward_error`.
+    """
+    problem, optimum = calibration.problem, calibration.optimum
+    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(optimum.unknowns, optimum.fit))
+    return np.array([_blocked_errors(calibration, jacobian, noise_K) for noise_K in _noises_K(calibration)])
+
+
+def _blocked_errors(calibration: Calibration, jacobian: FloatArray, noise_K: FloatArray) -> FloatArray:
+    """Return the error on each block beside a noise.
+
     At the optimum with Hessian H, leaving out block b moves the parameters by -(H - J_b' J_b)^-1 J_b' r_b, so that the
     residual on b becomes r_b + J_b (H - J_b' J_b)^-1 J_b' r_b: exact for a linear model, no refit needed. Where one block alone
     tells a parameter, it moves far: what the model predicts there is asked, and a refit where that is something else.
-    Readings count for as much as they do in the long run: a coarse model leaves a misfit that lasts, and counted sample by sample
-    what is left would seem to tell what it does not, and carry far away what only the whole record determines.
     """
     problem, unknowns = calibration.problem, calibration.optimum.unknowns
-    lasting_K = _lasting_noise_K(calibration)
-    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(unknowns, calibration.optimum.fit))
-    jacobian /= lasting_K[:, None]
-    residual = np.concatenate(calibration.residuals) / lasting_K
-    in_noise = np.broadcast_to(lasting_K / problem.noise_K, residual.shape)
+    jacobian = jacobian / noise_K[:, None]
+    residual = np.concatenate(calibration.residuals) / noise_K
+    in_own_noise = np.broadcast_to(noise_K / problem.noise_K, residual.shape)
     told_by = jacobian[np.isfinite(residual)]
     hessian = told_by.T @ told_by + np.diag(problem.prior()[1] ** -2.0)
     down, up = problem.step_bounds(unknowns)
@@ -62,7 +71,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
         inverse = np.linalg.pinv(rest * scale[:, None] * scale, rcond=1e-10, hermitian=True)
         move = scale * (inverse @ (scale * (rows.T @ left)))
-        predicted = (left + rows @ move) * in_noise[first:last][valid]
+        predicted = (left + rows @ move) * in_own_noise[first:last][valid]
         errors[b] = float(predicted @ predicted)
         moves[b, told] = -move
     if not told.all():
@@ -73,7 +82,7 @@ def blocked_errors(calibration: Calibration) -> FloatArray:
         out[first:last] = later[first:last]
         there = _error(problem, problem.solve(unknowns + moves[b], calibration.optimum.fit), out)
         if not abs(there - errors[b]) <= enough:
-            refitted = _predicted(calibration, lasting_K, out)
+            refitted = _predicted(calibration, noise_K, out)
             errors[b] = refitted if np.isfinite(refitted) else errors[b]
     return errors
 
@@ -90,13 +99,17 @@ def _predicted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) ->
     return np.inf if refit.status == "no_solution" else _error(problem, refit.fit, out)
 
 
-def _lasting_noise_K(calibration: Calibration) -> FloatArray:
-    """Return the noise of each sensor that its residual amounts to in the long run, no less than its own, (n_sensors,)."""
+def _noises_K(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
+    """Return each sensor's own noise, and no less than it what its residual amounts to in the long run, (n_sensors,) both.
+
+    A coarse model leaves a misfit that lasts. Counted sample by sample, readings seem to tell what they do not, and a refit to a
+    part of them may follow a misfit that wanders; by the noise that lasts it falls back on guesses where they tell little.
+    """
     problem, whitener = calibration.problem, calibration.whitener
     interval_s = sampling_step_s([segment.record for segment in problem.segments])
     n_valid = whitener.valid.sum(axis=0).tolist()
     lasting = [model.lasting(interval_s, n) for model, n in zip(whitener.models, n_valid, strict=True)]
-    return np.maximum(problem.noise_K, lasting)
+    return problem.noise_K, np.maximum(problem.noise_K, lasting)
 
 
 def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
@@ -118,12 +131,15 @@ def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatAr
     Returns
     -------
     (2,)
-        By refits beside the sensors' own noise, and beside the noise that lasts: the former may follow a misfit that wanders, the
-        latter falls back on what was guessed where readings tell little.
+        By refits beside the sensors' own noise, and beside the noise that lasts.
     """
     folds = [np.concatenate(fold) for fold in _folds(calibration.problem.segments, event_s)]
-    noises = (calibration.problem.noise_K, _lasting_noise_K(calibration))
-    return np.array([sum(_predicted(calibration, noise_K, fold) for fold in folds if fold.any()) for noise_K in noises])
+    return np.array(
+        [
+            sum(_predicted(calibration, noise_K, fold) for fold in folds if fold.any())
+            for noise_K in _noises_K(calibration)
+        ]
+    )
 
 
 def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]:

@@ -87,12 +87,12 @@ class Trial:
 
     @once
     def block_errors(self) -> FloatArray:
-        """Sum of squared weighted errors on each block predicted from the others, (n_blocks,)."""
+        """Sum of squared weighted errors on each block predicted from the others, by two fits, (2, n_blocks)."""
         return blocked_errors(self.calibration())
 
     @once
     def forward_error(self) -> FloatArray:
-        """Sum of squared weighted errors over parts of the training record that a refit has not seen, by two such, (2,)."""
+        """Sum of squared weighted errors over parts of the training record that a refit has not seen, by two refits, (2,)."""
         return forward_error(self.calibration())
 
     @once

@@ -82,8 +82,8 @@ def test_what_one_block_alone_tells_is_refitted(
 
     predicted = left_out._predicted
     monkeypatch.setattr(left_out, "_predicted", counted)
-    found, expected = blocked_errors(calibration), refitted(calibration)
-    assert len(calls) == n_refits
+    found, expected = blocked_errors(calibration)[0], refitted(calibration)
+    assert len(calls) == 2 * n_refits  # beside either noise
     assert np.abs(found - expected).max() <= 0.03 * expected.sum()
 
 

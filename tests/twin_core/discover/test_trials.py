@@ -135,7 +135,7 @@ def test_a_share_of_an_effect_lies_between_it_and_none() -> None:
 def test_left_out_blocks_are_predicted_as_by_a_refit() -> None:
     """The formula for leaving a block out against a true fit without it; nearly linear, so they agree to a few percent."""
     calibration = declared(0.0).calibration()
-    found = blocked_errors(calibration)
+    found = blocked_errors(calibration)[0]
     problem = calibration.problem
     (segment,) = problem.segments
     edges = np.linspace(0, segment.measured_K.shape[0], N_BLOCKS + 1).astype(int)
@@ -256,8 +256,24 @@ def test_a_simpler_model_that_runs_away_where_a_block_is_left_out_makes_an_effec
     """Parameters that a single block tells are anything without it."""
     base, right = trials
     before, after = (np.nanmean(np.concatenate(trial.calibration().residuals) ** 2) for trial in trials)
-    monkeypatch.setattr(Trial, "block_errors", lambda own: np.full(N_BLOCKS, 1e9 if own is base else 1.0))
+    monkeypatch.setattr(Trial, "block_errors", lambda own: np.full((2, N_BLOCKS), 1e9 if own is base else 1.0))
     assert validate(base, right).ratio == pytest.approx(np.sqrt(after / before))
+
+
+@pytest.mark.parametrize("worse", [0, 1])
+def test_where_refits_differ_the_less_favourable_one_counts(
+    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch, worse: int
+) -> None:
+    """Beside the sensors' own noise, or beside the noise that lasts."""
+    base, right = trials
+    after = np.full(2, 1.0)
+    after[worse] = 9.0
+    monkeypatch.setattr(
+        Trial, "block_errors", lambda own: (np.full(2, 4.0) if own is base else after)[:, None] * np.ones((2, N_BLOCKS))
+    )
+    monkeypatch.setattr(Trial, "forward_error", lambda own: np.full(2, 4.0) if own is base else after)
+    validation = validate(base, right)
+    assert (validation.ratio, validation.forward_ratio, validation.blocks_better) == (1.5, 1.5, 0.0)
 
 
 def test_a_correction_is_validated_as_it_is_handed_out(
