@@ -18,7 +18,8 @@ from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects.base import Effect
 
 N_RIVALS = 4
-"""Places of other names that are fitted for each effect, the best by linear screening."""
+"""Places of other names that are fitted for each effect, the best by linear screening: a limit of time. Of two cases with
+two effects both had a wrong name without it, and none at 1, 2, 4 and 8, which took 83, 85, 89 and 102 s."""
 
 
 def exchange(state: Search, needed: float) -> None:

@@ -48,7 +48,8 @@ def _blocked_errors(calibration: Calibration, jacobian: FloatArray, noise_K: Flo
 
     At the optimum with Hessian H, leaving out block b moves the parameters by -(H - J_b' J_b)^-1 J_b' r_b, so that the
     residual on b becomes r_b + J_b (H - J_b' J_b)^-1 J_b' r_b: exact for a linear model, no refit needed. Where one block alone
-    tells a parameter, it moves far: what the model predicts there is asked, and a refit where that is something else.
+    tells a parameter, it moves far: what the model predicts there is asked, and a refit where that is something else. Beside
+    another noise than that of the fit its optimum stands for the one there.
     """
     problem, unknowns = calibration.problem, calibration.optimum.unknowns
     jacobian = jacobian / noise_K[:, None]
