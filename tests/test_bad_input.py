@@ -268,6 +268,10 @@ ARGUMENTS: list[tuple[str, str]] = [
         "close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 0.01",
         "data.csv: a hold-out of 0.01 leaves 1 sample to predict",
     ),
+    (
+        "close-loop --spec spec.yaml --telemetry lone.csv --out x",
+        "lone.csv: 1 instant in all cannot be split by a hold-out of 0.3; give longer telemetry",
+    ),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --burn-in 9", "--burn-in belongs to"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out data.csv", "--out data.csv is a file"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --false-alarm-rate 2", "--false-alarm-rate must be"),
@@ -364,6 +368,7 @@ def desk(
     (tmp_path / "data.csv").write_text(pair_telemetry(40))
     (tmp_path / "data.txt").write_text(pair_telemetry(40))
     (tmp_path / "copy.csv").write_text(pair_telemetry(40))
+    (tmp_path / "lone.csv").write_text("".join(pair_telemetry(40).splitlines(keepends=True)[:2]))
     (tmp_path / "undated.csv").write_text("time_s,T_a,T_b,Q_a\n0,20,293,5\n")
     (tmp_path / "one.csv").write_text(pair_telemetry(1))
     (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(40))

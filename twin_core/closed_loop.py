@@ -17,7 +17,7 @@ from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
-from twin_core.discover.judge import NO_MODEL, Search
+from twin_core.discover.judge import MISTAKE, NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
 from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
@@ -32,7 +32,7 @@ from twin_core.network.spec import TwinSpec
 from twin_core.quality import quality_json, quality_strip
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
-from twin_core.report.mistakes import told_mistakes
+from twin_core.report.mistakes import look_for_mistakes, told_mistakes
 from twin_core.report.plots import build_plots
 from twin_core.telemetry import Record
 
@@ -134,6 +134,9 @@ def close_loop(
             progress=lambda f, m: progress(0.35 + 0.5 * f, m),
         )
         found.every = every
+        doubts = look_for_mistakes(found, deadline=latest)
+        if doubts.outdo(found):
+            found.give_up(MISTAKE)
         progress(0.88, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
         is_corrected = after is not before
@@ -146,7 +149,7 @@ def close_loop(
         progress(0.93, "drawing")
         missing = smooth_missing_heat(found, deadline=latest)
         report |= added_to_report(missing, report)
-        report |= told_mistakes(found, report, deadline=latest)
+        report |= told_mistakes(found, doubts, report)
         driven, notices = driven_heat(found, deadline=latest)
         report["notices"] += notices
         plots = build_plots(found, before, after, held, predictions, report, missing, driven)
@@ -194,8 +197,7 @@ def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[Ca
         found.failures.append(f"the corrected model: {error}")
         after = None
     if after is None:
-        found.rejected += [replace(f.judged, reason=NO_MODEL) for f in found.findings]
-        found.findings, found.trial = [], found.base
+        found.give_up(NO_MODEL)
     return after
 
 

@@ -78,7 +78,11 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
             held.append(HeldOut(lead, record.take(np.arange(record.time_s.size) >= before.sum() - 1)))
         kept -= span
     if not train or not held:
-        raise TelemetryError(f"holdout: {fraction:g} leaves nothing to train on or nothing to predict")
+        names, n_instants = ", ".join(r.name for r in records), sum(r.time_s.size for r in records)
+        raise TelemetryError(
+            f"{names}: {n_instants} instant{'s' if n_instants != 1 else ''} in all cannot be split by a hold-out of {fraction:g};"
+            " give longer telemetry"
+        )
     return train, held
 
 

@@ -289,10 +289,12 @@ def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
     """Return a statement for every sensor and input that never changes."""
     said = []
     for name in resting([*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)], records):
-        stuck = (
-            "; if the sensor is stuck, take it out: what is found around it is wrong" if name in spec.sensors else ""
+        meaning = (
+            "what rests tells nothing of capacities; if the sensor is stuck, take it out: what is found around it is wrong"
+            if name in spec.sensors
+            else "the record cannot tell its heat from any other steady heat where it acts"
         )
-        said.append(f"channel '{name}' never changes: what rests tells nothing of capacities{stuck}")
+        said.append(f"channel '{name}' never changes: {meaning}")
     return said
 
 

@@ -62,6 +62,9 @@ QUICK_ROUNDS, ROUNDS = 2, 4
 
 MOST_CLOSE = 6
 
+WITHOUT_PARAMETER = frozenset({"unit", "sign", "swapped sensors", "swapped loads", "misplaced load"})
+"""Mistakes that add no parameter where they are undone."""
+
 SAME = 0.95
 """A misfit that is no smaller than this share of another is the same."""
 
@@ -73,7 +76,7 @@ class Suspicion:
     Attributes
     ----------
     mistake
-        ``unit``, ``sign``, ``swapped sensors``, ``swapped loads``, ``held value`` or ``missing coupling``.
+        ``unit``, ``sign``, ``swapped sensors``, ``swapped loads``, ``misplaced load``, ``held value`` or ``missing coupling``.
     where
         Names of the channels, parameters or nodes.
     words
@@ -181,9 +184,11 @@ def variants(declared: Declared) -> list[Variant]:
 
     Swapped pairs, held values and couplings take turns: of a large network none of them is left out altogether.
     """
-    many: Iterable[Sequence[Variant | None]] = zip_longest(_swaps(declared), _held(declared), _couplings(declared))
+    many: Iterable[Sequence[Variant | None]] = zip_longest(
+        _swaps(declared), _misplaced(declared), _held(declared), _couplings(declared)
+    )
     turns = [one for turn in many for one in turn if one is not None]
-    return [*_temperature_units(declared), *_powers(declared), *turns]
+    return [*_temperature_units(declared), *_clocks(declared), *_powers(declared), *turns]
 
 
 def _changed(declared: Declared, columns: dict[str, Any]) -> Declared:
@@ -225,6 +230,20 @@ def _temperature_units(declared: Declared) -> Iterator[Variant]:
             )
 
 
+def _clocks(declared: Declared) -> Iterator[Variant]:
+    """Yield other units of time; dates have none, and an orbit is dated."""
+    if any(record.epoch_ns is not None for record in declared.records):
+        return
+    for factor, unit in ((1.0 / THOUSAND, "ms"), (60.0, "minutes"), (3600.0, "hours")):
+        words = f"the times are in {unit}, not in seconds"
+        yield Variant("unit", ("time_s",), words, partial(_paced, declared, factor))
+
+
+def _paced(declared: Declared, factor: float) -> Declared:
+    records = tuple(replace(record, time_s=factor * record.time_s) for record in declared.records)
+    return replace(declared, records=records)
+
+
 def _earthly(declared: Declared, name: str, shift_K: float) -> bool:
     middle = float(np.nanmedian(np.concatenate([r.values[name] for r in declared.records]))) + shift_K
     return EARTHLY_K[0] <= middle <= EARTHLY_K[1]
@@ -233,12 +252,26 @@ def _earthly(declared: Declared, name: str, shift_K: float) -> bool:
 def _swaps(declared: Declared) -> Iterator[Variant]:
     spec = declared.spec
     loads = list(dict.fromkeys(load.channel for load in spec.loads if load.table is None))
-    for kind, mistake, names in (("sensors", "swapped sensors", spec.sensors), ("loads", "swapped loads", loads)):
+    read = list(dict.fromkeys([*spec.sensors, *(b.channel for b in spec.boundaries.values() if b.channel is not None)]))
+    for kind, mistake, names in (("sensors", "swapped sensors", read), ("loads", "swapped loads", loads)):
         for a, b in combinations([n for n in names if _recorded(declared, n)], 2):
             exchanged = {a: lambda r, b=b: r.values[b], b: lambda r, a=a: r.values[a]}
             yield Variant(
                 mistake, (a, b), f"{kind} '{a}' and '{b}' are swapped", partial(_changed, declared, exchanged)
             )
+
+
+def _misplaced(declared: Declared) -> Iterator[Variant]:
+    """Yield loads at other nodes than declared."""
+    body = dump_spec(declared.spec)
+    loads = list(enumerate(declared.spec.loads))
+    for (i, load), node in ((one, node.id) for node in declared.spec.nodes for one in loads):
+        taken = {other.node for _, other in loads if other.channel == load.channel}
+        if load.table is None and node not in taken and _recorded(declared, load.channel):
+            moved = [{**own, "node": node} if j == i else own for j, own in enumerate(body["loads"])]
+            words = f"power channel '{load.channel}' heats '{node}', not '{load.node}'"
+            where = partial(_respecified, declared, {**body, "loads": moved})
+            yield Variant("misplaced load", (load.channel, node), words, where)
 
 
 def _held(declared: Declared) -> Iterator[Variant]:

@@ -1,4 +1,5 @@
-"""Coincidence: an event that sets in where an input changes as it does nowhere else may be what that input does."""
+"""When events set in: one where an input changes as it does nowhere else may be what that input does, one at an end of the
+record may have been so all along."""
 
 from collections.abc import Sequence
 
@@ -8,10 +9,14 @@ from twin_core._typing import BoolArray, FloatArray
 from twin_core.discover import policy
 from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
+from twin_core.effects.onset import MARGIN
 from twin_core.telemetry import Record
 
 N_BESIDE = 6
 """Samples on either side of an instant that count as the same moment: so closely have the onsets of the suites been found."""
+
+FEWEST_BESIDE = 2
+"""Samples that lie before an event and after it at least: the first one tells the initial state alone."""
 
 
 def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:
@@ -27,7 +32,7 @@ def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:
     effects
         Those that are asked.
     """
-    instants = [effect.values[q.name] for effect in effects for q in effect.parameter_specs() if q.instant is not None]
+    instants = _instants(effects)
     if not instants:
         return None
     spec = trial.fit.network.spec
@@ -39,6 +44,34 @@ def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:
             if alone[np.searchsorted(clock_s, within)].any():
                 return name
     return None
+
+
+def at_an_end(trial: Trial, effects: Sequence[Effect]) -> bool:
+    """Return whether an event sets in, or ends, so close to an end of the record that too little tells what was so without it.
+
+    No event is looked for there, but a fit may move one there, or out of the record: then it describes what was so all along.
+
+    Parameters
+    ----------
+    trial
+        With the effects, fitted, and the telemetry.
+    effects
+        Those that are asked: beside heat that wanders, and along open-loop trajectories, from which they are told.
+    """
+    if not _instants(effects):
+        return False
+    places = {effect.place for effect in effects}
+    instants = _instants([*effects, *(effect for effect in trial.present_effects if effect.place in places)])
+    segments = trial.fit.problem.segments
+    seen_s = np.sort(np.concatenate([s.record.clock_s[s.valid.any(axis=1)] for s in segments]))
+    before = np.searchsorted(seen_s, instants)
+    fewest = max(round(MARGIN * (seen_s.size - 1)), FEWEST_BESIDE)
+    return bool((np.minimum(before, seen_s.size - before) < fewest).any())
+
+
+def _instants(effects: Sequence[Effect]) -> list[float]:
+    """Return the instants at which effects set in or end."""
+    return [effect.values[q.name] for effect in effects for q in effect.parameter_specs() if q.instant is not None]
 
 
 def lone_changes(records: Sequence[Record], name: str) -> list[BoolArray]:

@@ -11,7 +11,7 @@ import numpy as np
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
-from twin_core.discover.coincidence import coinciding_channel
+from twin_core.discover.coincidence import at_an_end, coinciding_channel
 from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
 from twin_core.discover.once import keep, known
@@ -35,9 +35,11 @@ NO_FORESIGHT = "it does not predict what it was not fitted to better than the mo
 SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters of the model make up for it"
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"
+MISTAKE = "a mistake of the declaration would explain the readings better without any missing physics"
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 OUTDONE = "another effect in its place explains the readings better"
 COINCIDES = "it sets in when an input changes as nowhere else, which a law of that input would look like"
+AT_AN_END = "it sets in or ends where the record does, where too little tells it from what was so all along"
 NOT_EXAMINED = "its predictions could not be examined"
 NO_LAW = "a heat that repeats with temperature is left where it acts, so that the name would be wrong"
 SMALL_REMAINDER = "a heat that repeats with temperature is left where it acts, though little beside what it explains"
@@ -192,6 +194,11 @@ class Search:
 
             yield result
 
+    def give_up(self, reason: str) -> None:
+        """Give all findings up, for a reason: the declared model stays."""
+        self.rejected += [replace(finding.judged, reason=reason) for finding in self.findings]
+        self.findings, self.trial = [], self.base
+
     def count(self, n_looked_at: int, *, fallback: bool) -> int:
         """Return how many effects and places were tried: a fallback comes after all the named ones."""
         if fallback:
@@ -286,6 +293,8 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
         return replace(judged, reason=SIZE_NOT_DETERMINED), False
     if coinciding_channel(judged.trial, judged.effects) is not None:
         return replace(judged, reason=COINCIDES), False
+    if at_an_end(judged.trial, judged.effects):
+        return replace(judged, reason=AT_AN_END), False
     validation = validate(simple, judged.trial)
     if not validation.foresight < policy.FORESIGHT ** len(judged.effects):
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False

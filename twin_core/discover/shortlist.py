@@ -10,7 +10,8 @@ from twin_core.discover.metric import beside_gradients
 from twin_core.discover.screen import Probe, Screening, screen, screen_in, screen_sizes, survey_of
 from twin_core.discover.trial import Trial, about_trajectory
 from twin_core.effects import REGISTRY
-from twin_core.effects.base import Effect, Place, Survey
+from twin_core.effects.base import Effect, Place, Survey, touched_nodes
+from twin_core.network.doubts import unreached
 
 UNDECLARED_SHARES = (1.0, 0.1, 0.01)
 """Sizes of the undeclared heat at which candidates are screened, as shares of the fitted one."""
@@ -24,10 +25,13 @@ def candidates(
 ) -> tuple[Survey, list[Effect]]:
     """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks.
 
-    With ``nodes`` only those with one of them for their ``node``.
+    With ``nodes`` only those with one of them for their ``node``. At a node that nothing is declared to reach only couplings are
+    candidates: a heat there would warm it without end, and whatever moves it takes the name of the coupling that is missing.
     """
     survey = survey_of(fit)
     taken = {effect.place for effect in trial.effects}
+    couplings = [effect for effect in trial.effects if _couples(effect)]
+    apart = set(unreached(fit.network.spec)) - {n for c in couplings for n in touched_nodes(c, survey.layout)}
     effects = [
         effect
         for kind in REGISTRY.values()
@@ -36,8 +40,14 @@ def candidates(
         if nodes is None or where["node"] in nodes
         for effect in kind.starts(where, survey)
         if effect.place not in taken
+        and (not apart or _couples(effect) or not apart.issuperset(touched_nodes(effect, survey.layout)))
     ]
     return survey, effects
+
+
+def _couples(effect: Effect) -> bool:
+    """Return whether an effect exchanges heat between its place and another one."""
+    return not {"nodes", "boundary", "sink"}.isdisjoint(effect.where)
 
 
 def screened(

@@ -397,7 +397,7 @@ def about_trajectory(problem: Problem, optimum: Optimum, along: Calibration | No
         )
         for segment, path in zip(problem.segments, followed, strict=True)
     )
-    undeclared = first_size(problem, nominals)
+    undeclared = first_size(problem, values, nominals)
     return HeatFit(problem, free, undeclared, nominals, log_likelihood(problem, undeclared, nominals))
 
 

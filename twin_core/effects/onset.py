@@ -65,7 +65,8 @@ class OnsetEffect(Effect):
         """Yield onsets on both sides, as far as the neighbours on the grid of ``starts``."""
         samples = np.unique(survey.sample_s)
         own, reach = float(np.searchsorted(samples, self.values["time"])), samples.size / N_ONSETS
-        ranks = np.clip(np.linspace(own - reach, own + reach, N_REFINED), 1, samples.size - 1)
+        within = (max(MARGIN * samples.size, 1.0), (1.0 - MARGIN) * (samples.size - 1))
+        ranks = np.clip(np.linspace(own - reach, own + reach, N_REFINED), *within)
         yield from (self.first_seen_at(sample) for sample in _at_ranks(samples, ranks))
 
     def first_seen_at(self, sample_s: float) -> Self:

@@ -12,8 +12,10 @@ import numpy as np
 
 from twin_core._typing import FloatArray, Json
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, check_time, is_late, limited
+from twin_core.calibrate.identifiability import gone_far
 from twin_core.calibrate.undeclared.model import HeatFit, Nominal, floor_K2, states_of
 from twin_core.discover.judge import Search
+from twin_core.discover.trial import Trial, about_trajectory
 from twin_core.errors import TwinError
 from twin_core.gp.kernels import Matern
 from twin_core.gp.polynomial import ForcePolynomial
@@ -205,19 +207,21 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
     try:
         with limited(deadline):
             check_time()
-            force, model, observations, values, view = smoothed_force(search.base.fit, nodes)
+            fit = _as_told(search.base)
+            force, model, observations, values, view = smoothed_force(fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
         return MissingHeat(
             (), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",)
         )
-    watched = [force.nodes.index(search.base.fit.network.nodes.index(node)) for node in nodes]
+    network = fit.network
+    watched = [force.nodes.index(network.nodes.index(node)) for node in nodes]
     laws, notices = ({}, []) if is_late(deadline) else _laws(model, observations, values, force, watched)
     if view.first_step > 0:
         notices.append(
             f"missing heat: smoothed over the last {np.ptp(force.time_s):.0f} s of the training record alone"
         )
     states = force.temperature_K[1:]
-    effect, turnover = effect_heat(search, states, view.first_step), view.turnover_W(search.base.fit.network, states)
+    effect, turnover = effect_heat(search, states, view.first_step), view.turnover_W(network, states)
     heats = []
     for node, k in zip(nodes, watched, strict=True):
         at = force.nodes[k]
@@ -227,7 +231,6 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
             continue
         said = None if effect is None or np.isnan(effect[:, at]).any() else effect[:, at]
         time_s = view.forcing.stage_time_s[:, 1]
-        network = search.base.fit.network
         boundaries = view.moving_boundaries_K(network)
         drivers = {f"temperature of {name}": series for name, series in {node: states[:, at], **boundaries}.items()}
         others = {name: states[:, i] for i, name in enumerate(network.nodes) if i != at}
@@ -237,6 +240,17 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
         heats.append(NodeHeat(node, time_s, states[:, at], mean, std, said, laws.get(at), float(turnover[at]), follows))
     no_heat = bool(search.findings) and not (effect is not None and np.nan_to_num(effect).any())
     return MissingHeat(tuple(heats), tuple(notices), no_heat)
+
+
+def _as_told(base: Trial) -> HeatFit:
+    """Return the declared model beside undeclared heat, at about the parameters that the report tells.
+
+    Beside heat of any size parameters give way to what is missing, and so tell it best. Where guesses are far off they may take
+    a scale of their own as well, on which the declared heat does not count: then the heat would be told of another model.
+    """
+    told, beside_heat = base.calibration(), base.fit.network.parameters.as_dict()
+    far = gone_far(told.network.parameters, beside_heat)
+    return about_trajectory(told.problem, told.optimum) if far else base.fit
 
 
 def added_to_report(missing: MissingHeat, report: Json) -> Json:

@@ -33,14 +33,18 @@ def doubts(spec: TwinSpec, records: Sequence[Record]) -> tuple[str, ...]:
 
 def isolated(spec: TwinSpec) -> tuple[str, ...]:
     """Return a sentence for every node that has neither a coupling nor a load."""
+    return tuple(
+        f"node '{name}' has no coupling and no load: nothing can change its temperature; declare what does"
+        for name in unreached(spec)
+    )
+
+
+def unreached(spec: TwinSpec) -> tuple[str, ...]:
+    """Return the nodes that have neither a coupling nor a load."""
     reached = {end for conductor in spec.conductors for end in conductor.between}
     reached |= {radiator.node for radiator in spec.radiators} | {load.node for load in spec.loads}
     reached |= {end for coupling in spec.radiation for end in coupling.between} | {h.node for h in spec.heaters}
-    return tuple(
-        f"node '{node.id}' has no coupling and no load: nothing can change its temperature; declare what does"
-        for node in spec.nodes
-        if node.id not in reached
-    )
+    return tuple(node.id for node in spec.nodes if node.id not in reached)
 
 
 def _temperatures(spec: TwinSpec, records: Sequence[Record]) -> Iterator[str]:

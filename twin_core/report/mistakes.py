@@ -1,5 +1,6 @@
 """Mistakes of the declaration that would explain what a closed loop leaves unexplained, or how far its parameters went."""
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +10,16 @@ from twin_core.calibrate.containment import NO_DEADLINE
 from twin_core.calibrate.identifiability import nothing_moves
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.summary import stated_guesses
-from twin_core.calibrate.suspicions import MANY_NOISES, close_words, declared_of, is_odd, suspicions
+from twin_core.calibrate.suspicions import (
+    MANY_NOISES,
+    SAME,
+    WITHOUT_PARAMETER,
+    Looked,
+    close_words,
+    declared_of,
+    is_odd,
+    suspicions,
+)
 from twin_core.discover.judge import Search
 from twin_core.errors import ModelError, TelemetryError
 
@@ -18,42 +28,99 @@ MOST = 0.9
 difference is all there is; above this all but a tenth, as ``REPEATABLE_SHARE`` of the search has it."""
 
 
-def told_mistakes(search: Search, report: Json, *, deadline: float = NO_DEADLINE) -> Json:
+@dataclass(frozen=True)
+class Mistakes:
+    """What came of a look at the mistakes that a declaration may hold.
+
+    Attributes
+    ----------
+    looked
+        None where there was no reason to look, or no way.
+    notice
+        Why not, in words.
+    """
+
+    looked: Looked | None = None
+    notice: str = ""
+
+    def outdo(self, search: Search) -> bool:
+        """Return whether one of them, of the readings or of a place, would leave less than the findings do.
+
+        It adds no parameter, and the record speaks for it more: what was found beside it stands in for it.
+        """
+        if self.looked is None or not search.findings:
+            return False
+        of_data = (s.misfit for s in self.looked.found if s.mistake in WITHOUT_PARAMETER)
+        return min(of_data, default=np.inf) < SAME * misfit_of(search.trial.calibration())
+
+
+def misfit_of(calibration: Calibration) -> float:
+    """Return the root mean square residual of a calibration, in units of the sensors' noise."""
+    squares = np.concatenate(calibration.residuals) ** 2 / calibration.problem.noise_K**2
+    return float(np.sqrt(np.nanmean(squares)))
+
+
+def look_for_mistakes(search: Search, *, deadline: float = NO_DEADLINE) -> Mistakes:
+    """Look for mistakes of the declaration, where the fit of a finished search is odd.
+
+    Parameters
+    ----------
+    search
+        Its base is the declared model.
+    deadline
+        On the clock of ``time.monotonic``: no mistake is tried afterwards.
+    """
+    calibration, base = search.trial.calibration(), search.base.calibration()
+    still = nothing_moves(base.network.spec, [s.record for s in base.problem.segments])
+    if still or not is_odd(calibration.network.parameters, _guesses(search), misfit_of(calibration)):
+        return Mistakes()
+    try:
+        return Mistakes(suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline))
+    except (TelemetryError, ModelError) as error:  # what was found stands without it
+        return Mistakes(notice=f"mistakes of the declaration were not looked for: {error}")
+
+
+def told_mistakes(search: Search, mistakes: Mistakes, report: Json) -> Json:
     """Return what a report gains: under ``suspicions`` the mistakes that would explain more than the findings do, and words.
 
     Parameters
     ----------
     search
-        A finished search; its base is the declared model.
+        A finished search.
+    mistakes
+        What :func:`look_for_mistakes` returned of it.
     report
         The report so far: its words are not repeated.
-    deadline
-        On the clock of ``time.monotonic``: no mistake is tried afterwards.
     """
-    calibration = search.trial.calibration()
-    parameters, guesses = calibration.network.parameters, stated_guesses(search.base.calibration().problem.network)
-    squares = np.concatenate(calibration.residuals) ** 2 / calibration.problem.noise_K**2
-    misfit = float(np.sqrt(np.nanmean(squares)))
-    base = search.base.calibration()
-    still = nothing_moves(base.network.spec, [s.record for s in base.problem.segments])
-    if still or not is_odd(parameters, guesses, misfit):
+    looked = mistakes.looked
+    if looked is None and not mistakes.notice:
         return {"suspicions": []}
-    report = report | {"notices": [*contradictions(base), *report["notices"]]}
-    try:
-        looked = suspicions(declared_of(base.problem), base.network.parameters.as_dict(), deadline=deadline)
-    except (TelemetryError, ModelError) as error:  # what was found stands without it
-        notice = f"mistakes of the declaration were not looked for: {error}"
-        return {"suspicions": [], "notices": [*report["notices"], notice]}
+    notices = [*contradictions(search.base.calibration()), *report["notices"]]
+    if looked is None:
+        return {"suspicions": [], "notices": [*notices, mistakes.notice]}
+    calibration = search.trial.calibration()
+    misfit = misfit_of(calibration)
     better = [s for s in looked.found if s.misfit < misfit or not search.findings]
-    complete = looked.complete and not search.findings
-    told = report["words"]
-    words = close_words(parameters, guesses, misfit, better, told, complete=complete, left_out=looked.left_out)
+    words = close_words(
+        calibration.network.parameters,
+        _guesses(search),
+        misfit,
+        better,
+        report["words"],
+        complete=looked.complete and not search.findings,
+        left_out=looked.left_out,
+    )
     first = [line for line in words if line.startswith("perhaps ")]
     return {
         "suspicions": [s.to_json() for s in better],
         "words": [*report["words"], *(line for line in words if line not in first)],
-        "notices": [*first, *report["notices"]],
+        "notices": [*first, *notices],
     }
+
+
+def _guesses(search: Search) -> dict[str, float]:
+    """Return the guesses that the declaration states."""
+    return stated_guesses(search.base.calibration().problem.network)
 
 
 def contradictions(calibration: Calibration) -> list[str]:

@@ -118,6 +118,10 @@ def held(kind: str, position: int, key: str, factor: float) -> Mistake:
     return make
 
 
+def at_another_node(spec: dict[str, Any], values: dict[str, FloatArray]) -> None:
+    spec["loads"][1]["node"] = "tank"
+
+
 def without_coupling(spec: dict[str, Any], values: dict[str, FloatArray]) -> None:
     del spec["conductors"][3]
 
@@ -125,6 +129,7 @@ def without_coupling(spec: dict[str, Any], values: dict[str, FloatArray]) -> Non
 MISTAKES: list[tuple[str, Mistake, str, set[str]]] = [
     ("sensors swapped", exchanged("T_box", "T_tank"), "swapped sensors", {"T_box", "T_tank"}),
     ("loads swapped", exchanged("H_box", "H_battery"), "swapped loads", {"H_box", "H_battery"}),
+    ("load misplaced", at_another_node, "misplaced load", {"H_box", "box"}),
     ("power negated", scaled("H_box", -1.0), "sign", {"H_box"}),
     ("mW read as W", scaled("H_battery", 1000.0), "unit", {"H_battery"}),
     ("kW read as W", scaled("Q_sun", 1e-3), "unit", {"Q_sun"}),
@@ -156,6 +161,51 @@ def test_each_mistake_is_told(mistake: Mistake, expected: str, where: set[str], 
     assert (expected, where) in told, model.summary["words"]
     words = next(s["words"] for s in model.summary["suspicions"] if set(s["where"]) == where)
     assert any(words in line for line in model.summary["words"])
+
+
+def test_a_sensor_that_is_swapped_with_the_room_is_told() -> None:
+    """A heated block beside a cold one, in a room that warms and cools: the room's thermometer hangs on the cold block."""
+    time_s = DT_S * np.arange(N)
+    power = np.where(np.arange(N) // 60 % 2 == 0, 20.0, 4.0)
+    room = 293.0 + 3.0 * np.sin(2.0 * np.pi * time_s / 9000.0)
+    state, states = np.array([294.0, 293.0]), []
+    for k in range(N):
+        states.append(state)
+
+        def rate(_: float, x: FloatArray, k: int = k) -> FloatArray:
+            across = 0.6 * (x[0] - x[1])
+            return np.array(
+                [(power[k] - across - 0.2 * (x[0] - room[k])) / 900.0, (across - 0.5 * (x[1] - room[k])) / 400.0]
+            )
+
+        state = solve_ivp(rate, (0.0, DT_S), state, rtol=1e-8, atol=1e-8).y[:, -1]
+    read = np.array(states) + np.random.default_rng(6).normal(0.0, NOISE_K, (N, 2))
+    kelvin = {"kind": "temperature", "unit": "K"}
+    spec = {
+        "twin": "blocks",
+        "boundaries": {"room": {"channel": "T_room"}},
+        "channels": {"T_a": kelvin, "T_b": kelvin, "T_room": kelvin, "P": {"kind": "power", "unit": "W"}},
+        "nodes": [
+            {"id": "a", "sensor": "T_a", "capacity_J_per_K": {"guess": 1000.0}},
+            {"id": "b", "sensor": "T_b", "capacity_J_per_K": {"guess": 500.0}},
+        ],
+        "conductors": [
+            {"between": ["a", "b"], "conductance_W_per_K": {"guess": 0.5}},
+            {"between": ["a", "room"], "conductance_W_per_K": {"guess": 0.3}},
+            {"between": ["b", "room"], "conductance_W_per_K": {"guess": 0.3}},
+        ],
+        "loads": [{"channel": "P", "node": "a"}],
+    }
+    swapped = record_of(time_s, T_a=read[:, 0], T_b=room, T_room=read[:, 1], P=power)
+    told = calibrate(load_spec(spec), [swapped]).summary["suspicions"][0]
+    assert told["mistake"] == "swapped sensors" and set(told["where"]) == {"T_b", "T_room"}
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1000.0, "ms"), (1.0 / 60.0, "minutes"), (1.0 / 3600.0, "hours")])
+def test_a_clock_in_another_unit_is_told(factor: float, unit: str, flown: dict[str, FloatArray]) -> None:
+    """Nothing misfits but what is held: capacities alone tell how quick time passes."""
+    model = calibrate(load_spec(declaration()), [record_of(factor * DT_S * np.arange(N), **flown)])
+    assert model.summary["suspicions"][0]["words"] == f"the times are in {unit}, not in seconds"
 
 
 def test_a_right_declaration_raises_no_suspicion(flown: dict[str, FloatArray]) -> None:
@@ -211,10 +261,9 @@ def test_what_suspicions_cost_does_not_follow_the_network(n: int, monkeypatch: p
     looked = suspicions.suspicions(declared)
     assert len(fits) == looked.tried == suspicions.FIRST_CPU_S
     pairs, joints = n * (n - 1) // 2, n - 1
-    assert (
-        looked.possible == 2 * pairs - joints + joints // 2
-    )  # swaps, couplings that are missing, joints that are held
-    assert set(fits) == {"swapped sensors", "missing coupling", "held value"}
+    # Units of the clock, swaps, couplings that are missing, joints that are held.
+    assert looked.possible == 3 + 2 * pairs - joints + joints // 2
+    assert set(fits) == {"unit", "swapped sensors", "missing coupling", "held value"}
     assert not looked.complete and f"{looked.possible:,}" in looked.left_out and " 12 " in looked.left_out
     assert close_words(ParameterSet(()), {}, 9.0, [], complete=False, left_out=looked.left_out)[-1] == looked.left_out
 

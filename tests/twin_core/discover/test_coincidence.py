@@ -1,5 +1,7 @@
-"""An event where an input changes as nowhere else: told from one elsewhere, and from one beside changes like others."""
+"""An event where an input changes as nowhere else: told from one elsewhere, and from one beside changes like others; and one
+where the record begins or ends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,10 +12,11 @@ from hypothesis import strategies as st
 
 from twin_core._typing import FloatArray
 from twin_core.discover import policy
-from twin_core.discover.coincidence import N_BESIDE, coinciding_channel, lone_changes
+from twin_core.discover.coincidence import FEWEST_BESIDE, N_BESIDE, at_an_end, coinciding_channel, lone_changes
 from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
+from twin_core.effects.onset import MARGIN
 from twin_core.telemetry import Record
 
 N, STEP_S = 400, 10.0
@@ -25,8 +28,9 @@ def trial(*columns: FloatArray, name: str = "P") -> Trial:
     """Return what stands for a trial: a sensor that jumps wherever the channel does, and one record for each column."""
     spec = SimpleNamespace(channels=("T", name), sensors=("T",))
     records = [Record(STEP_S * np.arange(c.size), {"T": c, name: c}, None, "r") for c in columns]
-    problem = SimpleNamespace(segments=[SimpleNamespace(record=record) for record in records])
-    return cast(Trial, SimpleNamespace(fit=SimpleNamespace(network=SimpleNamespace(spec=spec), problem=problem)))
+    segments = [SimpleNamespace(record=r, valid=np.isfinite(r.values["T"])[:, None]) for r in records]
+    fit = SimpleNamespace(network=SimpleNamespace(spec=spec), problem=SimpleNamespace(segments=segments))
+    return cast(Trial, SimpleNamespace(fit=fit, present_effects=()))
 
 
 def step_at(sample: float) -> Effect:
@@ -65,6 +69,54 @@ def step_at(sample: float) -> Effect:
 )
 def test_an_event_coincides_with_a_change_like_no_other(column: FloatArray, sample: float, *, coincides: bool) -> None:
     assert coinciding_channel(trial(column), [step_at(sample)]) == ("P" if coincides else None)
+
+
+FIRST = MARGIN * (N - 1)
+
+
+@pytest.mark.parametrize(
+    ("sample", "is_at_an_end"),
+    [
+        (-3.5, True),
+        (round(FIRST) - 1.5, True),
+        (round(FIRST) - 0.5, False),
+        (199.5, False),
+        (N - 1 - round(FIRST) - 0.5, False),
+        (N - 1 - round(FIRST) + 1.5, True),
+        (N + 40.0, True),
+    ],
+    ids=[
+        "before it",
+        "at the beginning",
+        "the first that is looked for",
+        "within",
+        "the last one",
+        "at the end",
+        "after it",
+    ],
+)
+def test_an_event_at_an_end_of_the_record_may_have_been_so_all_along(sample: float, *, is_at_an_end: bool) -> None:
+    assert at_an_end(trial(ONCE), [step_at(sample)]) == is_at_an_end
+
+
+def test_unread_samples_tell_no_event_from_what_was_so_all_along() -> None:
+    """A third of the record lies before the event, and nothing was read there but the first sample."""
+    unread = np.where((np.arange(N) > FEWEST_BESIDE - 2) & (np.arange(N) < N // 3), np.nan, ONCE)
+    assert at_an_end(trial(unread), [step_at(N // 3 - 0.5)])
+    assert not at_an_end(trial(ONCE), [step_at(N // 3 - 0.5)])
+
+
+def test_an_event_is_asked_where_open_loop_trajectories_put_it() -> None:
+    asked = trial(ONCE)
+    moved = SimpleNamespace(fit=asked.fit, present_effects=(step_at(-3.5),))
+    assert at_an_end(cast(Trial, moved), [step_at(199.5)])
+    elsewhere = SimpleNamespace(fit=asked.fit, present_effects=(replace(step_at(-3.5), where={"node": "n2"}),))
+    assert not at_an_end(cast(Trial, elsewhere), [step_at(199.5)])
+
+
+def test_what_has_no_instant_lies_at_no_end() -> None:
+    load = REGISTRY["constant_heat_load"]({"node": "n1"}, {"Q_W": 1.0})
+    assert not at_an_end(trial(ONCE), [load])
 
 
 def test_what_has_no_instant_and_what_sensors_read_coincide_with_nothing() -> None:

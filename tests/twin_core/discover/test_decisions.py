@@ -17,6 +17,7 @@ from twin_core.discover.coarseness import least_explained, stands
 from twin_core.discover.evidence import Evidence, Validation
 from twin_core.discover.form import Repeatable
 from twin_core.discover.judge import (
+    AT_AN_END,
     COINCIDES,
     LESS_LIKELY,
     NO_FORESIGHT,
@@ -252,17 +253,18 @@ SCORE = score_needed(NEEDED)
 
 
 @pytest.mark.parametrize(
-    ("change", "score", "channel", "reason"),
+    ("change", "score", "channel", "at_an_end", "reason"),
     [
-        (0.0, SCORE, None, ""),
-        (-JUST, SCORE, None, LESS_LIKELY),
-        (0.0, SCORE - JUST, None, SIZE_NOT_DETERMINED),
-        (0.0, SCORE, "P", COINCIDES),
+        (0.0, SCORE, None, False, ""),
+        (-JUST, SCORE, None, False, LESS_LIKELY),
+        (0.0, SCORE - JUST, None, False, SIZE_NOT_DETERMINED),
+        (0.0, SCORE, "P", False, COINCIDES),
+        (0.0, SCORE, None, True, AT_AN_END),
     ],
-    ids=["all are enough", "less likely along its trajectories", "of no size", "with an input"],
+    ids=["all are enough", "less likely along its trajectories", "of no size", "with an input", "all along"],
 )
 def test_a_correction_is_told_by_its_own_trajectories(
-    monkeypatch: pytest.MonkeyPatch, change: float, score: float, channel: str | None, reason: str
+    monkeypatch: pytest.MonkeyPatch, change: float, score: float, channel: str | None, at_an_end: bool, reason: str
 ) -> None:
     """However much heat that wanders at the nodes may speak for it."""
     option = judged("a", 900.0)
@@ -274,6 +276,7 @@ def test_a_correction_is_told_by_its_own_trajectories(
     monkeypatch.setattr(judge, "validate", lambda *trials: option.validation)
     monkeypatch.setattr(judge, "least_wald_score", lambda *trials: score)
     monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: channel)
+    monkeypatch.setattr(judge, "at_an_end", lambda *arguments: at_an_end)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
     assert judge.examine(simple, option, NEEDED)[0].reason == reason
 

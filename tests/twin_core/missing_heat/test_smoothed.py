@@ -70,6 +70,18 @@ def test_hidden_heat_is_seen_where_it_is(search):
     assert seen.turnover_W == pytest.approx(radiated, rel=0.15)
 
 
+def test_heat_is_told_of_the_model_that_the_report_tells(search):
+    """Beside heat of any size a capacity of 1.4 kJ/K ended a hundred times larger: 1.5 kW were told where a heater gives 10 W."""
+    nodes = [SPEC["nodes"][0] | {"capacity_J_per_K": {"guess": 700.0}}, SPEC["nodes"][1]]
+    fit, calibration = fit_network(load_spec(SPEC | {"nodes": nodes}), [search.base.fit.problem.segments[0].record])
+    swollen = replace(fit, free=fit.free + np.log(100.0))
+    assert swollen.network.parameters.as_dict()["C:a"] > 3e4
+    base = Trial((), swollen, calibration.max_step_s, (calibration.optimum,))
+    heats = {heat.node: heat for heat in smooth_missing_heat(Search(base, base)).heats}
+    assert np.abs(heats["a"].mean_W).max() < 10.0
+    assert np.corrcoef(_hidden(heats["b"].time_s), heats["b"].mean_W)[0, 1] > 0.97
+
+
 def test_without_findings_there_is_nothing_to_agree_with(search):
     report = {"words": ["before"], "notices": ["old"]}
     added = added_to_report(smooth_missing_heat(search), report)

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from twin_core.calibrate.suspicions import Looked, Suspicion
 from twin_core.errors import TelemetryError
 from twin_core.report import mistakes
-from twin_core.report.mistakes import contradictions, told_mistakes
+from twin_core.report.mistakes import Mistakes, contradictions, look_for_mistakes, told_mistakes
 
 
 def calibration(residual_K: np.ndarray, nodes: dict[str, str]) -> Any:
@@ -68,9 +69,25 @@ def test_a_look_for_mistakes_that_fails_is_told_and_costs_no_report(monkeypatch:
     monkeypatch.setattr(mistakes, "suspicions", fails)
     trial: Any = SimpleNamespace(calibration=lambda: base)
     search: Any = SimpleNamespace(trial=trial, base=trial, findings=[])
-    told = told_mistakes(search, {"words": ["w"], "notices": ["n"]})
+    told = told_mistakes(search, look_for_mistakes(search), {"words": ["w"], "notices": ["n"]})
     assert told["suspicions"] == []
     assert told["notices"] == [
         "n",
         "mistakes of the declaration were not looked for: channel 'T_1' has no usable samples",
     ]
+
+
+@pytest.mark.parametrize(
+    ("mistake", "misfit", "outdone"),
+    [("unit", 0.9, True), ("swapped loads", 0.96, False), ("held value", 0.1, False), ("missing coupling", 0.1, False)],
+    ids=["explains more", "explains the same", "frees a parameter", "is missing physics itself"],
+)
+def test_a_mistake_of_the_data_that_explains_more_outdoes_findings(mistake: str, misfit: float, outdone: bool) -> None:
+    """Of what the findings leave; it would add no parameter."""
+    left = calibration(np.full((40, 1), 9.0), {"T_1": "a"})
+    search: Any = SimpleNamespace(trial=SimpleNamespace(calibration=lambda: left), findings=["one"])
+    looked = Looked([Suspicion(mistake, ("T_1",), "in words", 9.0 * misfit, 70.0)], 1, 1, complete=True)
+    assert Mistakes(looked).outdo(search) == outdone
+    search.findings = []
+    assert not Mistakes(looked).outdo(search)
+    assert not Mistakes().outdo(search)

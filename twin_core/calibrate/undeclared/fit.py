@@ -163,7 +163,7 @@ def fit_with_undeclared_heat(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
     )
-    typical = first_size(problem, first)
+    typical = first_size(problem, values, first)
 
     def begun(share: float) -> tuple[HeatFit, SizeSearch] | None:
         if share != START_SHARES[0] and is_late(deadline):

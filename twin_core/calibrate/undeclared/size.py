@@ -116,10 +116,19 @@ def span_s(nominals: Sequence[Nominal]) -> float:
     return max(float(n.segment.record.time_s[-1] - n.segment.record.time_s[0]) for n in nominals)
 
 
-def first_size(problem: Problem, nominals: Sequence[Nominal]) -> UndeclaredHeat:
-    """Return a starting size: the heat that the linearised model lacks from sample to sample, and the best length."""
+def first_size(problem: Problem, values: FloatArray, nominals: Sequence[Nominal]) -> UndeclaredHeat:
+    """Return a starting size: the heat that the linearised model lacks from sample to sample, and the best length.
+
+    Parameters
+    ----------
+    problem
+        Network and telemetry.
+    values : (n_parameters,)
+        Those about which the model was linearised: how much heat moves a node is up to its capacity there.
+    nominals
+        The linearised segments.
+    """
     span = span_s(nominals)
-    values = problem.network.parameters.values
     capacity = values[problem.network.capacity_index]
     swing = np.array([np.nanstd(n.starts_K, axis=0) for n in nominals]).max(axis=0)
     typical = 0.3 * capacity * np.maximum(swing, 0.1) / (0.02 * span)

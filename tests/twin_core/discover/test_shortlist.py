@@ -1,0 +1,53 @@
+"""Candidates where they can be: at a node that nothing reaches, couplings alone."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.helpers import conductive_spec, record_of
+from twin_core.calibrate.second_order import fit_network
+from twin_core.discover.shortlist import candidates
+from twin_core.discover.trial import Trial, try_effects
+from twin_core.effects import REGISTRY
+from twin_core.effects.base import Effect, touched_nodes
+from twin_core.network.spec_io import load_spec
+
+STEP_S, N = 60.0, 120
+
+
+@pytest.fixture(scope="module")
+def base() -> Trial:
+    """Return two nodes that are joined beside one that nobody joined to anything, which cools all the same."""
+    room: dict[str, Any] = {"boundaries": {"room": {"value_K": 290.0}}}
+    spec = conductive_spec(3, [(0, 1)], **room)
+    time_s = STEP_S * np.arange(N)
+    noise = np.random.default_rng(3).normal(0.0, 0.02, (3, N))
+    swing = np.sin(time_s / 900.0)
+    values = {"T0": 300.0 + swing, "T1": 300.0 - swing, "T2": 290.0 + 9.0 * np.exp(-time_s / 3000.0)}
+    record = record_of(time_s, **{name: v + e for (name, v), e in zip(values.items(), noise, strict=True)})
+    fit, calibration = fit_network(load_spec(spec), [record])
+    return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+
+
+def at(node: str, trial: Trial, *, fallback: bool) -> list[Effect]:
+    """Return the candidates that act at one node alone."""
+    survey, effects = candidates(trial, trial.fit, fallback=fallback)
+    return [effect for effect in effects if set(touched_nodes(effect, survey.layout)) == {node}]
+
+
+@pytest.mark.parametrize("fallback", [False, True])
+def test_at_a_node_that_nothing_reaches_couplings_alone_are_candidates(base: Trial, *, fallback: bool) -> None:
+    """A constant heat followed the first hour, and was five times as wrong on the rest as no heat at all."""
+    alone = at("n2", base, fallback=fallback)
+    joins = {"boundary", "sink"}
+    assert all(joins & effect.where.keys() for effect in alone)
+    assert not all(joins & effect.where.keys() for effect in at("n1", base, fallback=fallback))
+    assert fallback or {"leak_to_boundary", "radiation_to_sink"} & {effect.name for effect in alone}
+
+
+def test_once_a_coupling_is_found_a_node_may_have_any_effect(base: Trial) -> None:
+    leak = REGISTRY["leak_to_boundary"]({"node": "n2", "boundary": "room"}, {"G_W_per_K": 1.0})
+    found = try_effects(base, (leak,))
+    assert "constant_heat_load" not in {effect.name for effect in at("n2", base, fallback=False)}
+    assert "constant_heat_load" in {effect.name for effect in at("n2", found, fallback=False)}
