@@ -252,8 +252,7 @@ def _earthly(declared: Declared, name: str, shift_K: float) -> bool:
 def _swaps(declared: Declared) -> Iterator[Variant]:
     spec = declared.spec
     loads = list(dict.fromkeys(load.channel for load in spec.loads if load.table is None))
-    read = list(dict.fromkeys([*spec.sensors, *(b.channel for b in spec.boundaries.values() if b.channel is not None)]))
-    for kind, mistake, names in (("sensors", "swapped sensors", read), ("loads", "swapped loads", loads)):
+    for kind, mistake, names in (("sensors", "swapped sensors", spec.sensors), ("loads", "swapped loads", loads)):
         for a, b in combinations([n for n in names if _recorded(declared, n)], 2):
             exchanged = {a: lambda r, b=b: r.values[b], b: lambda r, a=a: r.values[a]}
             yield Variant(

@@ -11,7 +11,7 @@ from twin_core.discover.screen import Probe, Screening, screen, screen_in, scree
 from twin_core.discover.trial import Trial, about_trajectory
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, Place, Survey, touched_nodes
-from twin_core.network.doubts import unreached
+from twin_core.network.doubts import uncoupled
 
 UNDECLARED_SHARES = (1.0, 0.1, 0.01)
 """Sizes of the undeclared heat at which candidates are screened, as shares of the fitted one."""
@@ -25,13 +25,13 @@ def candidates(
 ) -> tuple[Survey, list[Effect]]:
     """Return the points of a fit, and every candidate effect at every place and setting that the trial lacks.
 
-    With ``nodes`` only those with one of them for their ``node``. At a node that nothing is declared to reach only couplings are
-    candidates: a heat there would warm it without end, and whatever moves it takes the name of the coupling that is missing.
+    With ``nodes`` only those with one of them for their ``node``. At a node without a declared coupling only couplings are
+    candidates: heat would warm it without end, and whatever else is named there stands in for the coupling that is missing.
     """
     survey = survey_of(fit)
     taken = {effect.place for effect in trial.effects}
     couplings = [effect for effect in trial.effects if _couples(effect)]
-    apart = set(unreached(fit.network.spec)) - {n for c in couplings for n in touched_nodes(c, survey.layout)}
+    apart = set(uncoupled(fit.network.spec)) - {n for c in couplings for n in touched_nodes(c, survey.layout)}
     effects = [
         effect
         for kind in REGISTRY.values()

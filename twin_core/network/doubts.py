@@ -41,10 +41,15 @@ def isolated(spec: TwinSpec) -> tuple[str, ...]:
 
 def unreached(spec: TwinSpec) -> tuple[str, ...]:
     """Return the nodes that have neither a coupling nor a load."""
-    reached = {end for conductor in spec.conductors for end in conductor.between}
-    reached |= {radiator.node for radiator in spec.radiators} | {load.node for load in spec.loads}
-    reached |= {end for coupling in spec.radiation for end in coupling.between} | {h.node for h in spec.heaters}
-    return tuple(node.id for node in spec.nodes if node.id not in reached)
+    fed = {load.node for load in spec.loads} | {heater.node for heater in spec.heaters}
+    return tuple(node for node in uncoupled(spec) if node not in fed)
+
+
+def uncoupled(spec: TwinSpec) -> tuple[str, ...]:
+    """Return the nodes that nothing is declared to couple to another one or to a boundary."""
+    joined = {end for coupling in (*spec.conductors, *spec.radiation) for end in coupling.between}
+    joined |= {radiator.node for radiator in spec.radiators}
+    return tuple(node.id for node in spec.nodes if node.id not in joined)
 
 
 def _temperatures(spec: TwinSpec, records: Sequence[Record]) -> Iterator[str]:

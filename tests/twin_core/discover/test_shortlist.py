@@ -1,4 +1,4 @@
-"""Candidates where they can be: at a node that nothing reaches, couplings alone."""
+"""Candidates where they can be: at a node without a coupling, couplings alone."""
 
 from typing import Any
 
@@ -18,13 +18,15 @@ STEP_S, N = 60.0, 120
 
 @pytest.fixture(scope="module")
 def base() -> Trial:
-    """Return two nodes that are joined beside one that nobody joined to anything, which cools all the same."""
+    """Return two nodes that are joined beside a heated one that nobody joined to anything, which cools all the same."""
     room: dict[str, Any] = {"boundaries": {"room": {"value_K": 290.0}}}
-    spec = conductive_spec(3, [(0, 1)], **room)
+    loads = {"loads": [{"channel": "P", "node": "n2"}], "channels": {"P": {"kind": "power", "unit": "W"}}}
+    spec = conductive_spec(3, [(0, 1)], **room, **loads)
     time_s = STEP_S * np.arange(N)
     noise = np.random.default_rng(3).normal(0.0, 0.02, (3, N))
     swing = np.sin(time_s / 900.0)
     values = {"T0": 300.0 + swing, "T1": 300.0 - swing, "T2": 290.0 + 9.0 * np.exp(-time_s / 3000.0)}
+    values["P"], noise = np.where(time_s < 3000.0, 1.0, 2.0), np.vstack([noise, np.zeros(N)])
     record = record_of(time_s, **{name: v + e for (name, v), e in zip(values.items(), noise, strict=True)})
     fit, calibration = fit_network(load_spec(spec), [record])
     return Trial((), fit, calibration.max_step_s, (calibration.optimum,))
@@ -37,7 +39,7 @@ def at(node: str, trial: Trial, *, fallback: bool) -> list[Effect]:
 
 
 @pytest.mark.parametrize("fallback", [False, True])
-def test_at_a_node_that_nothing_reaches_couplings_alone_are_candidates(base: Trial, *, fallback: bool) -> None:
+def test_at_a_node_without_a_coupling_couplings_alone_are_candidates(base: Trial, *, fallback: bool) -> None:
     """A constant heat followed the first hour, and was five times as wrong on the rest as no heat at all."""
     alone = at("n2", base, fallback=fallback)
     joins = {"boundary", "sink"}
