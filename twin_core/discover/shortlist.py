@@ -111,13 +111,26 @@ def _start(effect: Effect) -> tuple[object, int, tuple[float, ...]]:
 
 
 def refined(fit: HeatFit, effects: Sequence[Effect]) -> list[Effect]:
-    """Return effects at the best of their finer settings, where the first ones are too coarse for a local search."""
+    """Return effects at the best of their finer settings, where the first ones are too coarse for a local search.
+
+    An effect with a fuller form than its simplest one is returned in the best of either: a heat that came and went is none
+    that stays.
+    """
     survey = survey_of(fit)
     finer = [setting for effect in effects for setting in effect.refined(survey)]
+    several = {e.place: e for e in effects if type(e).completed is not Effect.completed}.values()
+    starts = [start for effect in several for start in type(effect).starts(effect.where, survey)]
+    fuller = [form for start in starts for form in start.completed(survey)]
+    simplest = [start for start in starts if any(True for _ in start.completed(survey))]
     n_samples = int(sum(nominal.segment.valid.sum() for nominal in fit.nominals))
-    ranked = best_of_each_place(screen(fit, survey, finer).probes, n_samples)
-    best = {probe.effect.place: probe.effect for probe in ranked}
-    return each_start([best.get(effect.place, effect) for effect in effects])
+
+    def best(settings: Sequence[Effect]) -> dict[Place, Effect]:
+        ranked = best_of_each_place(screen(fit, survey, settings).probes, n_samples) if settings else []
+        return {probe.effect.place: probe.effect for probe in ranked}
+
+    own = best(finer)
+    forms = [*best(fuller).values(), *best(simplest).values()]
+    return each_start([*(own.get(effect.place, effect) for effect in effects), *forms])
 
 
 def schwarz_gain(probe: Probe, n_samples: int) -> float:

@@ -92,6 +92,8 @@ def extend_by_trajectory(
     if not best:
         return False, []
     options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
+    if n_together > 1 and not fallback:
+        options = [*_alone(state, best[0]), *options]
     if min(options, key=worth).places == known:
         return False, []
     return accept(state, options, needed), [j.trial for j in sets]
@@ -170,6 +172,21 @@ def _fitted(state: Search, seed: Trial, effect: Effect, n_tried: int, *, beside_
     if trial is None:
         return None
     return _judged(state, trial, n_tried)
+
+
+def _alone(state: Search, judged: Judged) -> list[Judged]:
+    """Return the effect that was added last to a set without the others, if it can be fitted, settled.
+
+    From the model's own trajectories another effect may lead to it that is not needed once it is there.
+    """
+
+    def work() -> Judged | None:
+        *_, last = judged.trial.present_effects
+        trial = try_on_trajectories(state.trial, (*state.trial.present_effects, last), judged.trial.calibration())
+        return None if trial is None else _judged(state, resettled(state.trial, trial), state.n_named)
+
+    found = state.attempt(work, f"{judged.effects[-1].label} alone")
+    return [] if found is None else [found]
 
 
 def _judged(state: Search, trial: Trial, n_tried: int) -> Judged:

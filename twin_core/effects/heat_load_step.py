@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Self
 
 import numpy as np
@@ -12,6 +13,9 @@ from twin_core.effects.onset import OnsetEffect
 from twin_core.network.model import Addition, Layout
 from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
+
+EVERY = 2
+"""Of the instants at which a load may come on, one in so many is tried with one in so many ends."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +55,23 @@ class HeatLoadStep(OnsetEffect):
         end = (replace(onset, name="stop"),) if "stop" in self.values else ()
         return (amplitude, onset, *end)
 
+    @classmethod
+    def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
+        """Yield loads that stay, and on a coarser grid loads that end: of one of these a load that stays may show nothing."""
+        staying = list(super().starts(where, survey))
+        yield from staying
+        for begin, end in combinations(staying[::EVERY], 2):
+            yield begin.with_values({"stop": end.values["time"]})
+
+    def refined(self, survey: Survey) -> Iterable[Self]:
+        """Yield onsets on both sides, before the end if there is one."""
+        end = self.values.get("stop", np.inf)
+        yield from (effect for effect in super().refined(survey) if effect.values["time"] < end)
+
     def completed(self, survey: Survey) -> Iterable[Self]:
         """Yield the load with an end, at the instants of ``starts`` after it came on."""
         if "stop" not in self.values:
-            instants = (e.values["time"] for e in self.starts(self.where, survey))
+            instants = (e.values["time"] for e in super().starts(self.where, survey))
             yield from (self.with_values({"stop": end}) for end in instants if end > self.values["time"])
 
     def addition(self, layout: Layout) -> Addition:

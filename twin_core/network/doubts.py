@@ -47,7 +47,8 @@ def unreached(spec: TwinSpec) -> tuple[str, ...]:
 
 def uncoupled(spec: TwinSpec) -> tuple[str, ...]:
     """Return the nodes that nothing is declared to couple to another one or to a boundary."""
-    joined = {end for coupling in (*spec.conductors, *spec.radiation) for end in coupling.between}
+    joined = {end for conductor in spec.conductors for end in conductor.between}
+    joined |= {end for coupling in spec.radiation for end in coupling.between}
     joined |= {radiator.node for radiator in spec.radiators}
     return tuple(node.id for node in spec.nodes if node.id not in joined)
 

@@ -428,6 +428,7 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
 
     monkeypatch.setattr(trajectories, "_fitted", tried)
     monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
+    monkeypatch.setattr(trajectories, "_alone", lambda *a: [])
     monkeypatch.setattr(trajectories, "accept", accepted)
     state = Search(base, base, n_named=5)
     told, seeds = trajectories.extend_by_trajectory(state, NEEDED, [base], [], n_together, fallback=False)

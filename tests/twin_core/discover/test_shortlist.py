@@ -7,7 +7,7 @@ import pytest
 
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.second_order import fit_network
-from twin_core.discover.shortlist import candidates
+from twin_core.discover.shortlist import candidates, refined, survey_of
 from twin_core.discover.trial import Trial, try_effects
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect, touched_nodes
@@ -53,3 +53,17 @@ def test_once_a_coupling_is_found_a_node_may_have_any_effect(base: Trial) -> Non
     found = try_effects(base, (leak,))
     assert "constant_heat_load" not in {effect.name for effect in at("n2", base, fallback=False)}
     assert "constant_heat_load" in {effect.name for effect in at("n2", found, fallback=False)}
+
+
+def test_an_effect_that_may_end_is_tried_with_an_end_and_without(base: Trial) -> None:
+    """Of a load that came and went one that stays may explain nothing: neither may hide the other."""
+    kind, survey = REGISTRY["heat_load_step"], survey_of(base.fit)
+    starts = list(kind.starts({"node": "n0"}, survey))
+    staying, ending = ([s for s in starts if ("stop" in s.values) is ends] for ends in (False, True))
+    for chosen in (staying[9], ending[9]):
+        found = refined(base.fit, [chosen])
+        assert {"stop" in effect.values for effect in found} == {False, True}
+        assert all(effect.values["time"] < effect.values.get("stop", np.inf) for effect in found)
+        assert {effect.place for effect in found} == {chosen.place}
+    (lag,) = list(REGISTRY["sensor_lag"].starts({"sensor": "T0"}, survey))[:1]
+    assert len(refined(base.fit, [lag])) == 1
