@@ -265,7 +265,7 @@ class Effect(ABC):
         return ()
 
     def completed(self, survey: Survey) -> Iterable[Self]:
-        """Yield the fitted effect with what it may also have and its simplest form lacks, such as an end; most have no more."""
+        """Yield the effect with what it may also have and its simplest form lacks, such as an end; most have no more."""
         return ()
 
     def centred(self, survey: Survey) -> Self:
