@@ -15,11 +15,14 @@ from twin_core import closed_loop
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.summary import to_model
+from twin_core.calibrate.suspicions import Looked, Suspicion
 from twin_core.closed_loop import ClosedLoop, close_loop
+from twin_core.discover.judge import MISTAKE
 from twin_core.effects import REGISTRY
 from twin_core.errors import Cancelled, ModelError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.network.spec_io import load_spec
+from twin_core.report.mistakes import Mistakes
 from twin_core.telemetry import Record
 
 CASES = {
@@ -127,6 +130,30 @@ def test_a_corrected_model_that_cannot_predict_is_given_up(monkeypatch: pytest.M
     assert report["findings"] == [] and report["verdict"] != "effect_added"
     assert report["after"] == report["before"]
     assert any("no solution over the hold-out" in reason for reason in report["failures"])
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("effect", [None, "leak_to_boundary"])
+def test_a_mistake_of_the_declaration_comes_before_missing_physics(effect: str | None) -> None:
+    """Of a sensor in degC that was declared in K a heat of 6e10 W was told, beside the words that it was in degC."""
+    case = small_case(effect, CASES.get(effect or "", 1))
+    name = case.spec.sensors[0]
+    shifted = replace(case.record, values={**case.record.values, name: case.record.values[name] - 273.15})
+    report = close_loop(case.spec, [shifted]).report
+    assert report["findings"] == [] and report["verdict"] == "unexplained"
+    assert (report["suspicions"][0]["mistake"], report["suspicions"][0]["where"]) == ("unit", [name])
+    assert report["notices"][0].startswith(f"perhaps channel '{name}' is in degC, not in K")
+
+
+def test_findings_that_a_mistake_outdoes_are_listed_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = small_case("leak_to_boundary", CASES["leak_to_boundary"])
+    words = "sensors 'a' and 'b' are swapped"
+    looked = Looked([Suspicion("swapped sensors", ("a", "b"), words, 0.1, 90.0)], 1, 1, complete=True)
+    monkeypatch.setattr(closed_loop, "look_for_mistakes", lambda *given, **named: Mistakes(looked))
+    report = close_loop(case.spec, [case.record]).report
+    assert report["findings"] == [] and report["after"] == report["before"]
+    assert MISTAKE in {row["reason"] for row in report["not_supported"]}
+    assert any(words in line for line in report["notices"])
 
 
 def without_a_declared_solution(model: CalibratedModel, held: HeldOut, *, holding: bool = False) -> Prediction:
