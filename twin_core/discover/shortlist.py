@@ -46,8 +46,8 @@ def candidates(
 
 
 def _couples(effect: Effect) -> bool:
-    """Return whether an effect exchanges heat between its place and another one."""
-    return not {"nodes", "boundary", "sink"}.isdisjoint(effect.where)
+    """Return whether an effect exchanges heat between its place and another one, or a mass that nobody declared."""
+    return effect.adds_mass or not {"nodes", "boundary", "sink"}.isdisjoint(effect.where)
 
 
 def screened(

@@ -241,6 +241,8 @@ class Effect(ABC):
     ``radiation``, the difference of what black bodies at these temperatures emit."""
     fallback: ClassVar[bool] = False
     """True for an effect that is tried only where no named one is supported."""
+    adds_mass: ClassVar[bool] = False
+    """True for an effect that gives its place a mass to exchange heat with."""
 
     @abstractmethod
     def parameter_specs(self) -> tuple[ParameterSpec, ...]:

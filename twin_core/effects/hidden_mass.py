@@ -21,6 +21,7 @@ class HiddenMass(Effect):
     equation = "C_h dT_h/dt = G_h (T - T_h), q = G_h (T_h - T)"
     reference = "Paper A, section 2: nodes beyond the sensor locations (n > p)"
     sentence = "a thermal mass behind {node} was missing"
+    adds_mass = True
 
     def parameter_specs(self) -> tuple[ParameterSpec, ...]:
         """Return capacity and conductance; without conductance the mass is not there."""

@@ -88,6 +88,7 @@ def test_a_position_that_shades_is_found_and_told_over_pitch() -> None:
     assert len(lengths) == 1 and set(told["states"]["mean"]) == {1.0, 2.0}
 
 
+@pytest.mark.long
 def test_the_next_flight_is_predicted_to_the_resolution() -> None:
     report = solved(True).report
     assert report["before"]["rmse_K"] > 2.0

@@ -10,6 +10,7 @@ import pytest
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec
 from twin_core.closed_loop import close_loop
+from twin_core.discover.judge import MISTAKE
 from twin_core.effects import REGISTRY
 from twin_core.errors import TelemetryError
 from twin_core.network.spec_io import load_spec
@@ -104,10 +105,11 @@ def test_what_cannot_be_used_is_named(data: dict[str, Any], more: dict[str, np.n
 
 
 def test_a_wrong_unit_is_told_whatever_physics_would_stand_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One sensor reads K and is taken for degC: the effect that stands for it, a heater, does not stand unchallenged."""
+    """One sensor reads K and is taken for degC: the effect that stands for it, a heater, is given up for the mistake."""
     monkeypatch.setattr(REGISTRY, "_kinds", {name: REGISTRY[name] for name in ("proportional_heater", "sensor_lag")})
     report = close_loop(load_spec(PAIR), [record(T0=readings()["T0"] + 273.15)]).report
-    assert {finding["effect"] for finding in report["findings"]} == {"proportional_heater"}
+    assert report["findings"] == []
+    assert MISTAKE in {row["reason"] for row in report["not_supported"]}
     told = [row for row in report["suspicions"] if row["mistake"] == "unit"]
     assert told and told[0]["where"] == ["T0"]
     assert told[0]["misfit"] < 2.0

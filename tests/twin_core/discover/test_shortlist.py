@@ -43,7 +43,7 @@ def test_at_a_node_without_a_coupling_couplings_alone_are_candidates(base: Trial
     """A constant heat followed the first hour, and was five times as wrong on the rest as no heat at all."""
     alone = at("n2", base, fallback=fallback)
     joins = {"boundary", "sink"}
-    assert all(joins & effect.where.keys() for effect in alone)
+    assert [e.label for e in alone if not (joins & e.where.keys() or e.name == "hidden_mass")] == []
     assert not all(joins & effect.where.keys() for effect in at("n1", base, fallback=fallback))
     assert fallback or {"leak_to_boundary", "radiation_to_sink"} & {effect.name for effect in alone}
 
