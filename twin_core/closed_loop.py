@@ -140,6 +140,8 @@ def close_loop(
         progress(0.88, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
         is_corrected = after is not before
+        if not found.findings and doubts.looked is None:  # given up since: the declared model is asked
+            doubts = look_for_mistakes(found, deadline=latest)
         if lost is not None and not is_corrected:
             raise lost
         before = _stated(before, found, found.base, latest)

@@ -16,7 +16,8 @@ N_BESIDE = 6
 """Samples on either side of an instant that count as the same moment: so closely have the onsets of the suites been found."""
 
 FEWEST_BESIDE = 2
-"""Samples that lie before an event and after it at least: the first one tells the initial state alone."""
+"""Samples that lie before an event and after it at least, of a record so short that ``MARGIN`` is less: the first one tells the
+initial state alone."""
 
 
 def coinciding_channel(trial: Trial, effects: Sequence[Effect]) -> str | None:

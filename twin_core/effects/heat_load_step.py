@@ -15,7 +15,7 @@ from twin_core.network.terms import Along, Entry, Heat
 from twin_core.parameters.parameter import Parameter
 
 EVERY = 2
-"""Of the instants at which a load may come on, one in so many is tried with one in so many ends."""
+"""Of the instants at which a load may come on, one in so many is tried with one in so many ends: a limit of time."""
 
 
 @dataclass(frozen=True)
