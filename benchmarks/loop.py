@@ -160,12 +160,14 @@ def line(row: dict[str, Any]) -> str:
         if row["listed"]
         else "MISS"
     )
-    found = "; ".join(f"{f['effect']} {_values(f['where'])}" for f in row["findings"]) or row["verdict"]
+    found = "; ".join(f"{f['effect']} {where_in_words(f['where'])}" for f in row["findings"]) or row["verdict"]
     errors = f"{row['before_K']:.3f} -> {row['after_K']:.3f}"
-    return f"{mark} {row['task']} {_values(row['where'])}: {found} | {errors} (known {row['known_K']}) | {row['seconds']:.1f} s"
+    seconds = f"(known {row['known_K']}) | {row['seconds']:.1f} s"
+    return f"{mark} {row['task']} {where_in_words(row['where'])}: {found} | {errors} {seconds}"
 
 
-def _values(where: dict[str, Any]) -> str:
+def where_in_words(where: dict[str, Any]) -> str:
+    """Return where an effect acts: ``px,space``; a pair as ``px-mx``."""
     return ",".join("-".join(v) if isinstance(v, list) else str(v) for v in where.values())
 
 

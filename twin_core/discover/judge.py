@@ -305,7 +305,8 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     """Return why named effects are not the law of the heat that they stand for, if they are not; a free form claims no law.
 
-    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better.
+    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better. Nor
+    does it matter where its temperatures are a ``REPEATABLE_SHARE`` of those that the name explains.
     """
     named = [effect for effect in judged.effects if not effect.fallback]
     if not named:
@@ -316,7 +317,9 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     beside, other = against_free_forms(simple, trial, acts_at(trial, heats), named, needed, most)
     left = [beside.removed] if beside.log_bayes_factor > most else []
     left += [other] if other is not None else []
-    if not left or more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
+    if not left or max(left) <= policy.REPEATABLE_SHARE**2 * explained(simple, trial):
+        return ""
+    if more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
         return ""
     return SMALL_REMAINDER if max(left) <= _little(simple, trial, max(left)) else NO_LAW
 

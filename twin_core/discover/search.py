@@ -20,6 +20,7 @@ from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
+    NO_LAW,
     SIZE_NOT_DETERMINED,
     Judged,
     Search,
@@ -66,7 +67,7 @@ WIDENED = 1.0
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
 
-UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED)
+UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED, NO_LAW)
 """Why a single effect may be refused that is seen only beside another one."""
 
 N_UNSEEN = 2

@@ -1,4 +1,4 @@
-"""Heat that follows an auxiliary channel: attitude-steered sunlight, an instrument mode, a table position."""
+"""Heat that follows a channel that no load reads: attitude-steered sunlight, an instrument mode, a table position, a power."""
 
 from collections.abc import Iterable
 from typing import Self
@@ -16,6 +16,8 @@ from twin_core.orbit.environment import BETA
 N_KNOTS = 6
 OTHER_KNOTS = (4, 9, 13, 18)
 """Other numbers of knots that a curve is tried with where it is worth a refit; each value must pay for itself."""
+REACH = 2.0
+"""A heat in proportion to a power goes on up to so many times the largest one in the record."""
 EDGE = 1e-9
 """Share of the visited range by which a channel may leave it without a word."""
 MIN_SHARE = 0.02
@@ -23,6 +25,11 @@ MIN_SHARE = 0.02
 
 N_PARTS, MIN_PARTS = 8, 2
 """What a state does at a knot must be seen in so many parts of the record: only what repeats can be told from chance."""
+
+
+def in_proportion(series: FloatArray) -> tuple[float, float]:
+    """Return the two knots of a straight line over all that a power may be, none included."""
+    return min(0.0, REACH * float(series.min())), max(0.0, REACH * float(series.max()))
 
 
 def even_knots(series: FloatArray, n_knots: int = N_KNOTS) -> tuple[float, ...]:
@@ -99,6 +106,8 @@ class ChannelHeatLoad(Effect):
         if self._is_curve:
             series = survey.along.inputs[self.where["channel"]]
             knots = {even_knots(series, n) for n in (N_KNOTS, *OTHER_KNOTS)}
+            if survey.layout.spec.inputs[self.where["channel"]].kind == "power":
+                knots.add(in_proportion(series))
             for some in sorted(knots, key=len):
                 yield self._null(self.where, {"knots": some, "levels": False})
 
@@ -116,28 +125,38 @@ class ChannelHeatLoad(Effect):
 
     @classmethod
     def places(cls, layout: Layout) -> Iterable[Where]:
-        """Yield every node with every auxiliary channel, but where a table of that channel is declared.
+        """Yield every node with every auxiliary channel, but where a table of that channel is declared; and with every power
+        of the telemetry that no load reads.
 
         Not the parts of a quaternion, which mean nothing one by one, nor the orbit's angle to the Sun, which moves so
         slowly that it would explain any drift; nor what a formula gives, whose channels stand for themselves.
         """
-        mute = {f"{PREFIX}{BETA}", *layout.spec.attitude_channels, *layout.spec.derived}
-        declared = {(load.channel, load.node) for load in layout.spec.loads if load.table is not None}
-        auxiliary = [name for name, c in layout.spec.inputs.items() if c.kind == "auxiliary" and name not in mute]
+        spec = layout.spec
+        mute = {f"{PREFIX}{BETA}", *spec.attitude_channels, *spec.derived}
+        declared = {(load.channel, load.node) for load in spec.loads if load.table is not None}
+        channels = [name for name, c in spec.inputs.items() if c.kind == "auxiliary" and name not in mute]
+        channels += [
+            name for name, c in spec.channels.items() if c.kind == "power" and name not in spec.balance_channels
+        ]
         for node in layout.declared_nodes:
-            for channel in auxiliary:
+            for channel in channels:
                 if (channel, node) not in declared:
                     yield {"node": node, "channel": channel}
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
-        """Yield a table over the levels that the channel takes, or over its quantiles; and what a level does to others."""
+        """Yield a table over the levels that the channel takes, or over its range; a power's straight line; and what a level
+        does to others."""
         name = where["channel"]
         if name not in survey.along.inputs:
             return
         series = survey.along.inputs[name]
-        levels = survey.layout.spec.inputs[name].levels or np.unique(series).size <= 6
+        channel = survey.layout.spec.inputs[name]
+        is_power = channel.kind == "power"
+        levels = channel.levels or (np.unique(series).size <= 6 and not is_power)
         knots = survey.channel_levels.get(name) or tuple(np.unique(series))
+        if is_power and len(knots) > 1:
+            yield cls._null(where, {"knots": in_proportion(series), "levels": False})
         if not levels:
             knots = even_knots(series)
         if len(knots) < 2:

@@ -28,7 +28,13 @@ def doubts(spec: TwinSpec, records: Sequence[Record]) -> tuple[str, ...]:
     records
         Segments of telemetry in SI, without samples that are no readings; judged together.
     """
-    return (*_temperatures(spec, records), *_powers(spec, records), *isolated(spec))
+    return (*_temperatures(spec, records), *_powers(spec, records), *_unread(spec), *isolated(spec))
+
+
+def _unread(spec: TwinSpec) -> Iterator[str]:
+    for name, channel in spec.channels.items():
+        if channel.kind == "power" and name not in spec.balance_channels:
+            yield f"no load reads the power '{name}': if it heats a node, declare that as a load"
 
 
 def isolated(spec: TwinSpec) -> tuple[str, ...]:

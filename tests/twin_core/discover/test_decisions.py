@@ -287,6 +287,7 @@ def test_the_score_asked_for_is_that_of_normal_tables(rate: float, score: float)
 
 
 SMALL = REPEATABLE_SHARE * (10.0 - 1.0)
+NEARLY_ALL = REPEATABLE_SHARE**2 * (10.0 - 1.0)
 
 
 @pytest.mark.parametrize(
@@ -297,10 +298,16 @@ SMALL = REPEATABLE_SHARE * (10.0 - 1.0)
         (None, SMALL, 1.0, SMALL_REMAINDER),
         (SMALL + JUST, None, 1.0, NO_LAW),
         (0.1, SMALL + JUST, 1.0, NO_LAW),
-        (MOST_COARSENESS, None, 9000.0, SMALL_REMAINDER),
-        (MOST_COARSENESS + JUST, None, 9000.0, NO_LAW),
+        (MOST_COARSENESS, None, 100.0, SMALL_REMAINDER),
+        (MOST_COARSENESS + JUST, None, 100.0, NO_LAW),
+        (NEARLY_ALL - JUST, None, 1.0, ""),
+        (NEARLY_ALL + JUST, None, 1.0, SMALL_REMAINDER),
+        (0.01, NEARLY_ALL + JUST, 1.0, SMALL_REMAINDER),
     ],
-    ids=["a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"],
+    ids=[
+        *("a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"),
+        *("a tenth of its temperatures", "more than that", "more than that better"),
+    ],
 )
 def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     monkeypatch: pytest.MonkeyPatch, beside: float | None, instead: float | None, left: float, reason: str
@@ -325,7 +332,7 @@ def test_beside_much_that_stays_as_large_a_share_is_little(monkeypatch: pytest.M
     for removed, reason in ((at_most - JUST, SMALL_REMAINDER), (at_most + JUST, NO_LAW)):
         found = Repeatable(9e9, removed), None
         monkeypatch.setattr(judge, "against_free_forms", lambda *a, found=found: found)
-        assert judge._merely_resembles(stub(left=9000.0), option, NEEDED) == reason
+        assert judge._merely_resembles(stub(left=500.0), option, NEEDED) == reason
 
 
 def test_beside_a_sensors_effect_a_heat_may_be_left() -> None:
@@ -387,7 +394,7 @@ def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:
 
 @pytest.mark.parametrize(
     ("reason", "is_kept"),
-    [(NO_FORESIGHT, True), (LESS_LIKELY, True), (SIZE_NOT_DETERMINED, True), (NOT_SUPPORTED, False), (NO_LAW, False)],
+    [(NO_FORESIGHT, True), (LESS_LIKELY, True), (SIZE_NOT_DETERMINED, True), (NO_LAW, True), (NOT_SUPPORTED, False)],
 )
 def test_what_may_show_beside_another_effect_only_is_tried_with_others(reason: str, is_kept: bool) -> None:
     single, likelier = (replace(judged(node, nats), reason=reason) for node, nats in (("a", 50.0), ("b", 90.0)))

@@ -74,6 +74,13 @@ def test_an_isolated_node_is_told() -> None:
     assert said.startswith("node 'lost' has no coupling and no load")
 
 
+def test_a_power_that_no_load_reads_is_told() -> None:
+    data = declared().model_dump(exclude_none=True)
+    data["channels"]["P_spare"] = {"kind": "power", "unit": "W"}
+    (said,) = doubts(load_spec(data), [telemetry()])
+    assert said.startswith("no load reads the power 'P_spare'")
+
+
 def test_inputs_are_screened_in_excluded_intervals_too() -> None:
     data = declared().model_dump(exclude_none=True) | {"exclude": [{"start": 6000.0, "stop": 9000.0, "reason": "test"}]}
     record = telemetry()
