@@ -305,8 +305,7 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     """Return why named effects are not the law of the heat that they stand for, if they are not; a free form claims no law.
 
-    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better. Nor
-    does it matter where its temperatures are a ``REPEATABLE_SHARE`` of those that the name explains.
+    What a sensor does is no heat: one that is left beside it is another matter, unless it explains the readings far better.
     """
     named = [effect for effect in judged.effects if not effect.fallback]
     if not named:
@@ -317,11 +316,16 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
     beside, other = against_free_forms(simple, trial, acts_at(trial, heats), named, needed, most)
     left = [beside.removed] if beside.log_bayes_factor > most else []
     left += [other] if other is not None else []
-    if not left or max(left) <= policy.REPEATABLE_SHARE**2 * explained(simple, trial):
+    if not left or _hardly_shows(simple, trial, max(left)):
         return ""
     if more_is_left_elsewhere(trial, named, needed, beside if heats == named else None):
         return ""
     return SMALL_REMAINDER if max(left) <= _little(simple, trial, max(left)) else NO_LAW
+
+
+def _hardly_shows(simple: Trial, trial: Trial, removed: float) -> bool:
+    """Return whether the temperatures of a repeatable heat are a small share of those that a name explains, and more stays."""
+    return removed <= min(policy.REPEATABLE_SHARE**2 * explained(simple, trial), trial.unexplained() - removed)
 
 
 def _little(simple: Trial, trial: Trial, removed: float) -> float:

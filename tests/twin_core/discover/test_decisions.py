@@ -303,10 +303,13 @@ NEARLY_ALL = REPEATABLE_SHARE**2 * (10.0 - 1.0)
         (NEARLY_ALL - JUST, None, 1.0, ""),
         (NEARLY_ALL + JUST, None, 1.0, SMALL_REMAINDER),
         (0.01, NEARLY_ALL + JUST, 1.0, SMALL_REMAINDER),
+        (0.5 - JUST, None, 9000.0, ""),
+        (0.5 + JUST, None, 9000.0, SMALL_REMAINDER),
     ],
     ids=[
         *("a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"),
         *("a tenth of its temperatures", "more than that", "more than that better"),
+        *("less than stays beside it", "more than that beside it"),
     ],
 )
 def test_what_a_name_leaves_is_weighed_against_what_it_removes(
