@@ -60,9 +60,14 @@ class TakenOut:
 
 
 def parts(spec: TwinSpec, group: str) -> list[TakenOut]:
-    """Return the parts of a declaration without which it is still one."""
+    """Return the parts of a declaration without which it is still one: conductors, and loads whose channel no other one reads."""
+    read = [load.channel for load in spec.loads]
     own = [TakenOut(group, "conductors", i, "-".join(c.between)) for i, c in enumerate(spec.conductors)]
-    own += [TakenOut(group, "loads", i, f"{load.channel} at {load.node}") for i, load in enumerate(spec.loads)]
+    own += [
+        TakenOut(group, "loads", i, f"{load.channel} at {load.node}")
+        for i, load in enumerate(spec.loads)
+        if read.count(load.channel) == 1
+    ]
     left = [part for part in own if _is_declaration(without(spec, part))]
     return left[:: -(-len(left) // MOST_PARTS)]
 
