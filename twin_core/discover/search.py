@@ -20,7 +20,6 @@ from twin_core.discover.form import acts_at
 from twin_core.discover.judge import (
     LESS_LIKELY,
     NO_FORESIGHT,
-    NO_LAW,
     SIZE_NOT_DETERMINED,
     Judged,
     Search,
@@ -67,7 +66,7 @@ WIDENED = 1.0
 N_FIRST = 2
 """Options that screening puts first are always fitted further: a few passes tell more of the undeclared heat's size."""
 
-UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED, NO_LAW)
+UNSEEN = (NO_FORESIGHT, LESS_LIKELY, SIZE_NOT_DETERMINED)
 """Why a single effect may be refused that is seen only beside another one."""
 
 N_UNSEEN = 2

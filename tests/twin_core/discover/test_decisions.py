@@ -397,7 +397,7 @@ def test_a_costly_value_is_computed_once_and_holds_up_no_other_object() -> None:
 
 @pytest.mark.parametrize(
     ("reason", "is_kept"),
-    [(NO_FORESIGHT, True), (LESS_LIKELY, True), (SIZE_NOT_DETERMINED, True), (NO_LAW, True), (NOT_SUPPORTED, False)],
+    [(NO_FORESIGHT, True), (LESS_LIKELY, True), (SIZE_NOT_DETERMINED, True), (NOT_SUPPORTED, False), (NO_LAW, False)],
 )
 def test_what_may_show_beside_another_effect_only_is_tried_with_others(reason: str, is_kept: bool) -> None:
     single, likelier = (replace(judged(node, nats), reason=reason) for node, nats in (("a", 50.0), ("b", 90.0)))
