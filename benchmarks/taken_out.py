@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.loop import place, run_all, where_in_words
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_sets import present
@@ -22,6 +24,7 @@ from twin_core.closed_loop import close_loop
 from twin_core.errors import TwinError
 from twin_core.network.model import build_network
 from twin_core.network.spec import Conductor, Load, TwinSpec
+from twin_core.telemetry import Record
 
 SETS = (
     "three blocks: 12 h, then 12 h",
@@ -86,10 +89,12 @@ def _is_declaration(spec: TwinSpec) -> bool:
     return True
 
 
-def places(spec: TwinSpec, part: TakenOut) -> set[tuple[str, frozenset[Any]]]:
-    """Return names and places of the effects that would put a part back."""
+def places(spec: TwinSpec, part: TakenOut, records: Sequence[Record] = ()) -> set[tuple[str, frozenset[Any]]]:
+    """Return names and places of the effects that would put a part back; a load that rests all along is a constant one."""
     taken: Conductor | Load = getattr(spec, part.kind)[part.position]
     if isinstance(taken, Load):
+        if records and np.ptp(np.concatenate([record.values[taken.channel] for record in records])) == 0.0:
+            return {place({"effect": "constant_heat_load", "where": {"node": taken.node}})}
         return {place({"effect": "channel_heat_load", "where": {"node": taken.node, "channel": taken.channel}})}
     boundaries = [end for end in taken.between if end in spec.boundaries]
     if not boundaries:
@@ -115,7 +120,7 @@ def run(part: TakenOut, data: Path, deadline_s: float) -> dict[str, Any]:
         burn_in_s=given.burn_in_s,
         deadline_s=deadline_s,
     ).report
-    right = places(given.spec, part)
+    right = places(given.spec, part, given.records)
     found = report["findings"]
     return {
         "task": part.name,

@@ -22,7 +22,8 @@ from twin_core.errors import TelemetryError
 from twin_core.report.phrasing import headline
 
 SOLVERS = (
-    *(f"numpy.linalg.{name}" for name in ("solve", "svd", "pinv", "eigh")),
+    "numpy.linalg.svd",
+    *(pytest.param(f"numpy.linalg.{name}", marks=pytest.mark.long) for name in ("solve", "pinv", "eigh")),
     "twin_core.calibrate.optimise.cho_factor",
     "twin_core.calibrate.optimise.cho_solve",
     "twin_core.gp.noise_model.minimize",
