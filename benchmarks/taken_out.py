@@ -133,6 +133,7 @@ def run(part: TakenOut, data: Path, deadline_s: float) -> dict[str, Any]:
         "found": "; ".join(f"{row['effect']} {where_in_words(row['where'])}" for row in found),
         "before_K": report["before"]["rmse_K"],
         "after_K": report["after"]["rmse_K"],
+        "is_cut": any("the deadline ended the search" in notice for notice in report["notices"]),
     }
 
 
@@ -159,7 +160,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             row["group"],
             row["words"],
             verdict(row),
-            row["found"] or row["verdict"],
+            (row["found"] or row["verdict"]) + (" (at the deadline)" if row.get("is_cut") else ""),
             f"{row['before_K']:.3f}",
             f"{row['after_K']:.3f}",
             f"{row['seconds']:.0f}",

@@ -66,8 +66,12 @@ def at_an_end(trial: Trial, effects: Sequence[Effect]) -> bool:
     segments = trial.fit.problem.segments
     seen_s = np.sort(np.concatenate([s.record.clock_s[s.valid.any(axis=1)] for s in segments]))
     before = np.searchsorted(seen_s, instants)
-    fewest = max(round(MARGIN * (seen_s.size - 1)), FEWEST_BESIDE)
-    return bool((np.minimum(before, seen_s.size - before) < fewest).any())
+    return bool((np.minimum(before, seen_s.size - before) < _fewest(seen_s.size)).any())
+
+
+def _fewest(n_samples: int) -> int:
+    """Return how many samples must lie before what happens and after it, or too little tells what it did."""
+    return max(round(MARGIN * (n_samples - 1)), FEWEST_BESIDE)
 
 
 def _instants(effects: Sequence[Effect]) -> list[float]:
@@ -91,10 +95,15 @@ def lone_changes(records: Sequence[Record], name: str) -> list[BoolArray]:
 
 
 def _changes(values: FloatArray) -> FloatArray:
-    """Return by how much a channel changes over the stretch about each sample, (n_samples,); gaps are held over."""
+    """Return by how much a channel changes over the stretch about each sample, (n_samples,); gaps are held over.
+
+    What it does at the ends of the record is left out: too little tells what follows from it.
+    """
     known = np.flatnonzero(np.isfinite(values))
     if known.size == 0:
         return np.zeros(values.size)
     at = np.arange(values.size)
     held = values[known[np.maximum(np.searchsorted(known, at, side="right") - 1, 0)]]
-    return np.asarray(np.abs(held[np.minimum(at + N_BESIDE, at[-1])] - held[np.maximum(at - N_BESIDE, 0)]))
+    first = min(_fewest(at.size), at[-1])
+    last = max(first, at[-1] - first)
+    return np.asarray(np.abs(held[np.clip(at + N_BESIDE, first, last)] - held[np.clip(at - N_BESIDE, first, last)]))

@@ -51,6 +51,8 @@ def step_at(sample: float) -> Effect:
         (ONCE + np.where(np.arange(N) > 300, 2.4, 0.0), 199.5, True),
         (ONCE + np.where(np.arange(N) > 300, 2.6, 0.0), 199.5, False),
         (np.where(np.abs(np.arange(N) - 198) < 2, np.nan, ONCE), 199.5, True),
+        (ONCE + np.where(np.arange(N) > N - 1 - round(MARGIN * (N - 1)), 9.0, 0.0), 199.5, True),
+        (ONCE + np.where(np.arange(N) > N - 2 - round(MARGIN * (N - 1)), 9.0, 0.0), 199.5, False),
         (np.full(N, np.nan), 199.5, False),
     ],
     ids=[
@@ -64,6 +66,8 @@ def step_at(sample: float) -> Effect:
         "others half as large",
         "others larger than half",
         "a gap at the switching",
+        "another at the end",
+        "another near the end",
         "no reading",
     ],
 )
@@ -147,9 +151,15 @@ def test_lone_changes_are_those_of_a_plain_count(columns: list[list[int]], varia
     about = policy.THRESHOLDS["LONE_CHANGE"]
     factor = getattr(about, variant) if variant else policy.LONE_CHANGE
     records = [Record(np.arange(float(len(c))), {"P": np.array(c, dtype=float)}, None, "r") for c in columns]
-    changes = [
-        [abs(c[min(i + N_BESIDE, len(c) - 1)] - c[max(i - N_BESIDE, 0)]) for i in range(len(c))] for c in columns
-    ]
+    changes = []
+    for c in columns:
+        left_out = min(max(round(MARGIN * (len(c) - 1)), FEWEST_BESIDE), len(c) - 1)
+        within = [c[left_out]] * left_out + c[left_out : len(c) - left_out]  # held beyond where too little tells
+        within += [within[-1]] * (len(c) - len(within))
+        within = within[: len(c)]
+        changes.append(
+            [abs(within[min(i + N_BESIDE, len(c) - 1)] - within[max(i - N_BESIDE, 0)]) for i in range(len(c))]
+        )
     expected = [
         [
             factor
