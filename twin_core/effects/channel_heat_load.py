@@ -10,14 +10,12 @@ from twin_core.effects.base import Beyond, Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
-from twin_core.network.terms import Along, SteeredTable, TableLoad, nearest
+from twin_core.network.terms import Along, ChannelLoad, SteeredTable, TableLoad, nearest
 from twin_core.orbit.environment import BETA
 
 N_KNOTS = 6
 OTHER_KNOTS = (4, 9, 13, 18)
 """Other numbers of knots that a curve is tried with where it is worth a refit; each value must pay for itself."""
-REACH = 2.0
-"""A heat in proportion to a power goes on up to so many times the largest one in the record."""
 EDGE = 1e-9
 """Share of the visited range by which a channel may leave it without a word."""
 MIN_SHARE = 0.02
@@ -27,9 +25,9 @@ N_PARTS, MIN_PARTS = 8, 2
 """What a state does at a knot must be seen in so many parts of the record: only what repeats can be told from chance."""
 
 
-def in_proportion(series: FloatArray) -> tuple[float, float]:
-    """Return the two knots of a straight line over all that a power may be, none included."""
-    return min(0.0, REACH * float(series.min())), max(0.0, REACH * float(series.max()))
+def in_proportion(series: FloatArray) -> tuple[float]:
+    """Return the one knot of a heat in proportion to a power: the largest that it is."""
+    return (float(series[np.abs(series).argmax()]),)
 
 
 def even_knots(series: FloatArray, n_knots: int = N_KNOTS) -> tuple[float, ...]:
@@ -49,8 +47,9 @@ def revisited(at: BoolArray, n_least: float) -> bool:
 class ChannelHeatLoad(Effect):
     """q = f(x): piecewise linear over knots, or one value per level; or per level another table of a declared channel.
 
-    The latter is what a commanded state does that shades or exposes parts: what attitude brings in differs from state to
-    state. The declared table tells it for the state that is visited most, the effect how the others differ from that.
+    With a single knot it is in proportion to the channel: a load that was not declared. The latter is what a commanded state
+    does that shades or exposes parts: what attitude brings in differs from state to state. The declared table tells it for
+    the state that is visited most, the effect how the others differ from that.
     """
 
     name = "channel_heat_load"
@@ -72,6 +71,10 @@ class ChannelHeatLoad(Effect):
         """Whether the heat is a curve over its own channel, rather than levels or another channel's table by state."""
         return "across" not in self.settings and not self.settings["levels"]
 
+    @property
+    def _is_in_proportion(self) -> bool:
+        return len(self.settings["knots"]) == 1
+
     def _interpolation_error_W(self) -> FloatArray:
         """Return by how much a smooth curve lies off the best straight lines between its knots, (n_knots,).
 
@@ -88,7 +91,7 @@ class ChannelHeatLoad(Effect):
 
     def beyond(self, layout: Layout, along: Along) -> Beyond | None:
         """Return where the channel leaves the range of the knots: the heat is held there, a curve would have gone on."""
-        if not self._is_curve:
+        if not self._is_curve or self._is_in_proportion:
             return None
         knots = np.array(self.settings["knots"], dtype=np.float64)
         x = along.inputs[self.where["channel"]]
@@ -115,6 +118,8 @@ class ChannelHeatLoad(Effect):
         """Return the table."""
         own, node, channel = self.settings, layout.node(self.where["node"]), self.where["channel"]
         knots, parameters = tuple(own["knots"]), self.parameters()
+        if self._is_in_proportion:
+            return Addition((ChannelLoad(node, channel, 1.0 / knots[0], False, parameters),))
         if "across" not in own:
             return Addition((TableLoad(node, channel, knots, bool(own["levels"]), 1.0, False, parameters),))
         solar, states, rests = bool(own["solar"]), tuple(own["states"]), tuple(own["levels"])
