@@ -106,11 +106,9 @@ class ChannelHeatLoad(Effect):
 
     def refined(self, survey: Survey) -> Iterable[Self]:
         """Yield the curve over fewer and over more knots."""
-        if self._is_curve:
+        if self._is_curve and not self._is_in_proportion:
             series = survey.along.inputs[self.where["channel"]]
             knots = {even_knots(series, n) for n in (N_KNOTS, *OTHER_KNOTS)}
-            if survey.layout.spec.inputs[self.where["channel"]].kind == "power":
-                knots.add(in_proportion(series))
             for some in sorted(knots, key=len):
                 yield self._null(self.where, {"knots": some, "levels": False})
 
@@ -150,18 +148,19 @@ class ChannelHeatLoad(Effect):
 
     @classmethod
     def starts(cls, where: Where, survey: Survey) -> Iterable[Self]:
-        """Yield a table over the levels that the channel takes, or over its range; a power's straight line; and what a level
-        does to others."""
+        """Yield a table over the levels that the channel takes, or over its range, and what a level does to others; of a power
+        what is in proportion to it."""
         name = where["channel"]
         if name not in survey.along.inputs:
             return
         series = survey.along.inputs[name]
         channel = survey.layout.spec.inputs[name]
-        is_power = channel.kind == "power"
-        levels = channel.levels or (np.unique(series).size <= 6 and not is_power)
+        if channel.kind == "power":
+            if np.ptp(series) > 0.0:
+                yield cls._null(where, {"knots": in_proportion(series), "levels": False})
+            return
+        levels = channel.levels or np.unique(series).size <= 6
         knots = survey.channel_levels.get(name) or tuple(np.unique(series))
-        if is_power and len(knots) > 1:
-            yield cls._null(where, {"knots": in_proportion(series), "levels": False})
         if not levels:
             knots = even_knots(series)
         if len(knots) < 2:
