@@ -49,7 +49,7 @@ TO_BOUNDARY = ("leak_to_boundary", "radiation_to_sink", "nonlinear_convection")
 
 @dataclass(frozen=True)
 class TakenOut:
-    """One part of one declaration: where in ``conductors`` or ``loads`` it stands, and what names it may have."""
+    """One part of one declaration: the split, ``conductors`` or ``loads``, where it stands there, and what it joins or feeds."""
 
     group: str
     kind: str

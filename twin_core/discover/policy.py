@@ -109,7 +109,8 @@ THRESHOLDS: dict[str, Threshold] = {
     "REPEATABLE_SHARE": Threshold(
         "share of evidence, and of the variance that a name removes",
         "a name leaves no heat that repeats with temperature and is worth more than so much of its own evidence; up to as large a"
-        " share of the misfit that the name removes, and of what stays, it is little; in a coarse network names that explain all"
+        " share of the misfit that the name removes, and of what stays, it is little, and up to its square of the former, less"
+        " than stays, no objection at all; in a coarse network names that explain all"
         " but so much of what a finding explains are its alternatives",
         "a tenth: a law with a parameter of its own that is off by a third of its value leaves about as much",
         1e12,
