@@ -111,7 +111,7 @@ def with_own_states(effect: Effect, network: Network, along: Along) -> Along:
 
     found = [along.temperatures_K[0, own]]
     for span in pairwise(along.time_s.tolist()):  # no step over a kink of the straight lines between the points
-        found.append(solve_ivp(rates, span, found[-1], rtol=1e-10, atol=1e-10).y[:, -1])
+        found.append(solve_ivp(rates, span, found[-1], method="LSODA", rtol=1e-10, atol=1e-10).y[:, -1])
     return replace(along, temperatures_K=np.hstack([along.temperatures_K[:, :n], np.array(found)]))
 
 

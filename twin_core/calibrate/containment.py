@@ -1,12 +1,15 @@
 """What ends one start or refinement, and never the run: failures of arithmetic, and the time that is up."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import partial
 from typing import TypeVar
 
 from numpy.linalg import LinAlgError
+
+from twin_core.side_by_side import side_by_side
 
 NUMERICAL_FAILURES = (LinAlgError, ArithmeticError)
 """What a factorisation or an overflow raises. Errors of programming are none of them and end the run."""
@@ -65,3 +68,19 @@ def attempted(work: Callable[[], T], what: str, failures: list[str]) -> T | None
     except NUMERICAL_FAILURES as error:
         failures.append(f"{what}: {error}" if str(error) else f"{what}: {type(error).__name__}")
         return None
+
+
+def those_that_work(works: Sequence[Callable[[], T]]) -> list[T]:
+    """Return what works return that do not fail numerically, done side by side; where all fail, the first failure is raised."""
+    results = side_by_side([partial(_returned, work) for work in works])
+    done = [result for result in results if not isinstance(result, Exception)]
+    if not done:
+        raise next(result for result in results if isinstance(result, Exception))
+    return done
+
+
+def _returned(work: Callable[[], T]) -> T | Exception:
+    try:
+        return work()
+    except NUMERICAL_FAILURES as error:
+        return error

@@ -34,6 +34,7 @@ from twin_core.discover.trial import (
     explained,
     mean_excess,
     resettled,
+    resettled_near,
     shared_unknowns,
     try_on_trajectories,
 )
@@ -52,6 +53,10 @@ first: heat that wanders at the nodes, or trajectories alone, may put it behind 
 
 N_VARIED = 6
 """Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
+
+HOPELESS_NATS = 10.0
+"""Names that are so much less likely than is asked for, fitted from the simpler model's heat, are not fitted from their own
+trajectories too: of 20 that were not supported either way, these ended 3 nats higher at most."""
 
 
 def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, needed: float) -> Finding:
@@ -86,25 +91,43 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         *((effect, [fitted_before]) for effect in before),
         *((effect, starts_beside_gradients(simple)) for effect in beside),
     ]
-    fitted = state.attempt_each(
-        [
-            (
-                partial(_explaining, simple, starts, effect, state.trial, least, goal),
-                f"{effect.label} instead of {own.label}",
-            )
-            for effect, starts in options
-        ]
-    )
-    best: dict[Place, Trial] = {}
-    for trial in sorted((trial for trial in fitted if trial is not None), key=lambda trial: trial.unexplained()):
-        best.setdefault(trial.effects[-1].place, trial)
+    best = _best_of_each_place(state, simple, finding, options, least, goal)
     told = state.attempt_each(
-        [
-            (partial(_supported, state, simple, t, needed), f"{t.effects[-1].label} instead of {own.label}")
-            for t in best.values()
-        ]
+        [(partial(_supported, state, simple, t, needed), f"{t.effects[-1].label} instead of {own.label}") for t in best]
     )
     return Finding(finding.judged, (*finding.alternatives, *once_each([j for j in told if j is not None])))
+
+
+def _best_of_each_place(
+    state: Search,
+    simple: Trial,
+    finding: Finding,
+    options: Sequence[tuple[Effect, Sequence[Calibration]]],
+    least: float,
+    goal: float,
+) -> list[Trial]:
+    """Return names as good as what was found, the one of each place that leaves the least.
+
+    A place is fitted from its other starts only where the first one ended where readings are less likely than with the finding.
+    """
+    enough, found = state.trial.log_evidence() - policy.ALTERNATIVE_NATS, state.trial
+    best: dict[Place, Trial] = {}
+    told: set[Place] = set()
+    places = [effect.place for effect, _ in options]
+    is_first = [places.index(place) == i for i, place in enumerate(places)]
+    for turn in (True, False):
+        asked = [o for o, own in zip(options, is_first, strict=True) if own is turn and o[0].place not in told]
+        works = [partial(_explaining, simple, starts, effect, found, least, goal) for effect, starts in asked]
+        labels = [f"{effect.label} instead of {finding.judged.labels}" for effect, _ in asked]
+        for trial in state.attempt_each(list(zip(works, labels, strict=True))):
+            if trial is None:
+                continue
+            place = trial.effects[-1].place
+            if place not in best or trial.unexplained() < best[place].unexplained():
+                best[place] = trial
+            if trial.least_evidence > enough or trial.log_evidence() > enough:
+                told.add(place)
+    return sorted(best.values(), key=lambda trial: trial.unexplained())
 
 
 def _near(simple: Trial, start: Calibration, found: Calibration, own: Effect, known: Collection[Place]) -> list[Effect]:
@@ -204,7 +227,8 @@ def _explaining(
     enough = found.log_evidence() - policy.ALTERNATIVE_NATS
     if trial.near[0].status == "given_up":
         return trial if trial.least_evidence > enough else None
-    return trial if explained(simple, trial, found) >= least or trial.log_evidence() > enough else None
+    likely = trial.log_evidence() > enough  # asked of every one, here, where several are fitted at once
+    return trial if likely or explained(simple, trial, found) >= least else None
 
 
 def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Judged | None:
@@ -213,9 +237,11 @@ def _supported(state: Search, simple: Trial, trial: Trial, needed: float) -> Jud
     The undeclared heat beside it is a first guess, while the simpler model's was fitted: where that speaks against the effect, it
     is fitted too.
     """
-    n_tried = max(state.n_named, 1)
-    evidence = weigh(simple, trial, n_tried)
-    if evidence.log_bayes_factor <= needed:
-        trial = resettled(simple, trial)
-        evidence = weigh(simple, trial, n_tried)
-    return Judged(trial.effects[-1:], evidence, trial) if evidence.log_bayes_factor > needed else None
+    n_tried, found = max(state.n_named, 1), trial
+    evidence = weigh(simple, found, n_tried)
+    for refit, least in ((resettled_near, -np.inf), (resettled, needed - HOPELESS_NATS)):
+        if not least <= evidence.log_bayes_factor <= needed:
+            break
+        found = refit(simple, trial)
+        evidence = weigh(simple, found, n_tried)
+    return Judged(found.effects[-1:], evidence, found) if evidence.log_bayes_factor > needed else None

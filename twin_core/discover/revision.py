@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from twin_core.calibrate.containment import those_that_work
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import least_explained, times_asked
@@ -27,7 +28,6 @@ from twin_core.discover.judge import (
 )
 from twin_core.discover.trial import Trial, by_chance, explained, mean_excess, try_effects
 from twin_core.effects.base import Effect
-from twin_core.side_by_side import side_by_side
 
 N_EXCHANGED = 2
 """Refused options that are tried in the place of a finding."""
@@ -276,7 +276,7 @@ def _refitted(effects: Sequence[Effect], state: Search) -> Trial:
     there = {effect.place for effect in below.effects}
     more = [effect for effect in effects if effect.place not in there]
     starts = [(state.trial, effects), (below, (*below.effects, *more))]
-    fits = side_by_side([partial(try_effects, *start, n_passes=10) for start in starts])
+    fits = those_that_work([partial(try_effects, *start, n_passes=10) for start in starts])
     return max(fits, key=lambda trial: weigh(state.base, trial, 1).log_bayes_factor)
 
 

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from twin_core._typing import FloatArray, IntArray
-from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.containment import attempted, those_that_work
 from twin_core.calibrate.discrepancy import Discrepancy, discrepancy
 from twin_core.calibrate.gradients import WithGradients, with_gradients
 from twin_core.calibrate.optimise import Optimum, minimise
@@ -21,7 +21,6 @@ from twin_core.discover.left_out import blocked_errors, forward_error
 from twin_core.discover.once import once
 from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
-from twin_core.side_by_side import side_by_side
 
 LN_2, LN_3 = np.log([2.0, 3.0]).tolist()
 
@@ -303,7 +302,7 @@ def try_effects(base: Trial, effects: Sequence[Effect], *, n_passes: int = 3) ->
                 break
         starts.append(shorter)
     fitted = partial(fit_with_undeclared_heat, problem, near=base.fit, n_passes=n_passes)
-    fits = side_by_side([partial(fitted, start) for start in starts])
+    fits = those_that_work([partial(fitted, start) for start in starts])
     fit = max(fits, key=lambda f: f.log_posterior)
     return Trial(
         fitted_effects(effects, fit.network.parameters.as_dict()), fit, base.max_step_s, simpler=base, below=base
@@ -351,14 +350,22 @@ def resettled(simple: Trial, rich: Trial) -> Trial:
         fit_with_undeclared_heat, calibration.problem, free, early_prior_std=(np.inf,) * 3
     )
     along: Callable[[], HeatFit] = partial(fit_with_undeclared_heat, calibration.problem, free, near=rich.fit)
+    fits: list[HeatFit] = those_that_work([own, along, partial(_fit_near, simple, rich)])
+    return _settled_at(simple, rich, max(fits, key=lambda f: f.log_posterior))
 
-    def near() -> HeatFit:
-        return try_effects(simple, rich.present_effects, n_passes=15).fit
 
-    fits: list[HeatFit] = side_by_side([own, along, near])
-    fit = max(fits, key=lambda f: f.log_posterior)
+def resettled_near(simple: Trial, rich: Trial) -> Trial:
+    """Return the same from the simpler trial's fit alone, which takes a quarter of the time and is mostly as likely."""
+    return _settled_at(simple, rich, _fit_near(simple, rich))
+
+
+def _fit_near(simple: Trial, rich: Trial) -> HeatFit:
+    return try_effects(simple, rich.present_effects, n_passes=15).fit
+
+
+def _settled_at(simple: Trial, rich: Trial, fit: HeatFit) -> Trial:
     effects = fitted_effects(rich.effects, fit.network.parameters.as_dict())
-    return replace(rich, effects=effects, fit=fit, near=(calibration.optimum,), simpler=None, below=simple)
+    return replace(rich, effects=effects, fit=fit, near=(rich.calibration().optimum,), simpler=None, below=simple)
 
 
 def converged(trial: Trial) -> Trial:

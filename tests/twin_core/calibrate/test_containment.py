@@ -10,7 +10,7 @@ import pytest
 from tests.analytic import laplacian, linear_states
 from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate import calibrate
-from twin_core.calibrate.containment import attempted
+from twin_core.calibrate.containment import attempted, those_that_work
 from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem
@@ -138,3 +138,17 @@ def test_a_deadline_that_is_far_changes_nothing() -> None:
     spec, record = pair()
     free, bound = calibrate(spec, [record]), calibrate(spec, [record], deadline=time.monotonic() + 1e6)
     assert free.values == bound.values
+
+
+def test_a_start_that_fails_takes_none_with_it() -> None:
+    def fails() -> float:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    def is_wrong() -> float:
+        raise TypeError("not an array")
+
+    assert those_that_work([fails, lambda: 2.0, fails]) == [2.0]
+    with pytest.raises(np.linalg.LinAlgError, match="Singular"):
+        those_that_work([fails, fails])
+    with pytest.raises(TypeError):
+        those_that_work([lambda: 1.0, is_wrong])

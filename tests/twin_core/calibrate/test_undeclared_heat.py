@@ -236,12 +236,19 @@ def test_a_fit_to_other_readings_takes_over_none_of_their_pattern() -> None:
     np.testing.assert_array_equal(nominal.grid.interval, afresh.interval)
 
 
-@pytest.mark.parametrize("curvature", [1e-3, 1.0, 1e4])
-def test_what_a_search_of_sizes_remembers_wrongly_does_not_hold_it_up(curvature: float) -> None:
-    """The heat was far larger or smaller when the slope's change was seen: passes come to the same sizes all the same."""
+@pytest.mark.parametrize(
+    "curvature",
+    [1e-3 * np.eye(3), np.eye(3), 1e4 * np.eye(3), 1e204 * np.ones((3, 3))],
+    ids=["1e-3", "1", "1e4", "none"],
+)
+def test_what_a_search_of_sizes_remembers_wrongly_does_not_hold_it_up(curvature: np.ndarray) -> None:
+    """The heat was far larger or smaller when the slope's change was seen: passes come to the same sizes all the same.
+
+    Of a start at which readings were as unlikely as exp(-1e204) it remembered a singular matrix, and the right name failed.
+    """
     problem, _ = three_nodes(2, 20.0)
     fit = fit_with_undeclared_heat(problem)
-    sizes = SizeSearch(0.1, curvature * np.eye(3))
+    sizes = SizeSearch(0.1, curvature)
     found = replace(fit.undeclared, std_W=5.0 * fit.undeclared.std_W)
     value = -np.inf
     for _ in range(12):

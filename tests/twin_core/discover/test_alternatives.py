@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from tests.twin_core.discover.stubs import CHANCE, JUST, NEEDED, judged, load, stub
 from twin_core.discover import alternatives, trajectories
-from twin_core.discover.alternatives import _cost_of_explaining, add_coarse_alternatives
+from twin_core.discover.alternatives import HOPELESS_NATS, _cost_of_explaining, add_coarse_alternatives
 from twin_core.discover.evidence import Evidence
 from twin_core.discover.judge import Finding, Search
 from twin_core.discover.policy import ALTERNATIVE_NATS, LARGEST_NOISE, REPEATABLE_SHARE
@@ -27,6 +27,8 @@ class Fits:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: tuple[float, float], nats: tuple[float, float]) -> None:
         self.rough, self.fine = dict(zip(("bare", "fitted"), left, strict=True)), nats
         self.settled: list[float] = []
+        self.tries: list[Any] = []
+        self.near = nats[0]
         self.beside: list[str] = []
         self.likelier = self.least = -1e3
         self.status = "converged"
@@ -40,6 +42,7 @@ class Fits:
             "_near_beside_gradients": lambda *given: [load(node) for node in self.beside],
             "try_on_trajectories": self.tried,
             "resettled": self.resettled,
+            "resettled_near": self.resettled_near,
             "weigh": lambda simple, rich, n_tried: Evidence(rich.nats, 0.0),
         }.items():
             monkeypatch.setattr(alternatives, name, value)
@@ -59,11 +62,15 @@ class Fits:
 
     def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any, goal: float) -> Any:
         self.goal = goal
+        self.tries.append(starts)
         return self.trial(min(self.rough[str(start)] for start in starts), self.fine[0])
 
     def resettled(self, simple: Trial, rich: Any) -> Any:
         self.settled.append(rich.unexplained())
         return self.trial(rich.unexplained(), self.fine[1])
+
+    def resettled_near(self, simple: Trial, rich: Any) -> Any:
+        return self.trial(rich.unexplained(), self.near)
 
     def told(self) -> list[str]:
         finding = Finding(judged("a", 50.0))
@@ -73,21 +80,37 @@ class Fits:
 
 
 @pytest.mark.parametrize(
-    ("nats", "settles", "told"),
+    ("nats", "near", "settles", "told"),
     [
-        ((NEEDED + JUST, -9.0), False, ["b"]),
-        ((-133.0, NEEDED + JUST), True, ["b"]),
-        ((NEEDED, NEEDED), True, []),
+        ((NEEDED + JUST, -9.0), -9.0, False, ["b"]),
+        ((-133.0, -9.0), NEEDED + JUST, False, ["b"]),
+        ((-133.0, NEEDED + JUST), NEEDED - HOPELESS_NATS, True, ["b"]),
+        ((-133.0, NEEDED + JUST), NEEDED - HOPELESS_NATS - JUST, False, []),
+        ((NEEDED, NEEDED), NEEDED, True, []),
     ],
-    ids=["supported as it is", "by a fitted heat only", "not supported"],
+    ids=["as it is", "by a heat fitted from the simpler model", "by a fitted heat only", "hopeless", "not supported"],
 )
 def test_an_alternative_is_weighed_with_its_heat_fitted_where_the_first_guess_speaks_against_it(
-    monkeypatch: pytest.MonkeyPatch, nats: tuple[float, float], told: list[str], *, settles: bool
+    monkeypatch: pytest.MonkeyPatch, nats: tuple[float, float], near: float, told: list[str], *, settles: bool
 ) -> None:
     """Beside a first guess a leak that leaves as little as radiation was less likely than nothing, by 134 nats."""
     fits = Fits(monkeypatch, (LEFT + 0.1, LEFT), nats)
+    fits.near = near
     assert fits.told() == told
     assert fits.settled == ([LEFT] if settles else [])
+
+
+@pytest.mark.parametrize(
+    ("likelier", "tries"), [(-ALTERNATIVE_NATS, [("bare",), ("fitted",)]), (-ALTERNATIVE_NATS + JUST, [("bare",)])]
+)
+def test_a_place_as_likely_as_what_was_found_is_not_fitted_from_its_other_starts(
+    monkeypatch: pytest.MonkeyPatch, likelier: float, tries: list[Any]
+) -> None:
+    """A load that begins some time was fitted fourteen times at the node of a constant one, each time to the same end."""
+    fits = Fits(monkeypatch, (LEFT, LEFT), (9.0, 9.0))
+    fits.likelier = likelier
+    assert fits.told() == ["b"]
+    assert fits.tries == tries
 
 
 @pytest.mark.parametrize(

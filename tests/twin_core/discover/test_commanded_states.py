@@ -95,6 +95,7 @@ def test_the_next_flight_is_predicted_to_the_resolution() -> None:
     assert report["after"]["rmse_K"] < 2.0 * RESOLUTION_K
 
 
+@pytest.mark.long
 def test_what_a_position_adds_is_told_within_its_uncertainty() -> None:
     told = solved(True).report["findings"][0]["parameters"]
     cells = zip(

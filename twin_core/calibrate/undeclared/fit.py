@@ -12,7 +12,7 @@ import numpy as np
 
 from twin_core._typing import FloatArray
 from twin_core.calibrate.bounded import bounded_step
-from twin_core.calibrate.containment import NO_DEADLINE, check_time, is_late
+from twin_core.calibrate.containment import NO_DEADLINE, check_time, is_late, those_that_work
 from twin_core.calibrate.problem import Problem, Segment
 from twin_core.calibrate.starting import filled_columns
 from twin_core.calibrate.undeclared.model import (
@@ -26,8 +26,7 @@ from twin_core.calibrate.undeclared.model import (
     states_of,
     whiten,
 )
-from twin_core.calibrate.undeclared.size import SizeSearch, first_size
-from twin_core.side_by_side import side_by_side
+from twin_core.calibrate.undeclared.size import SETTLED_NATS, SizeSearch, first_size
 
 EARLY_PRIOR_STD = (0.2, 0.2, 0.3, 0.3, 0.5, 1.0)
 """Prior deviations of logarithmic parameters in the first passes, while the undeclared heat is still too large."""
@@ -46,9 +45,6 @@ MOST_REFUSED = 2
 
 LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
-
-SETTLED_NATS, SETTLED_LOG_STEP = 0.2, 0.3
-"""A pass that adds less than this to the log-likelihood, with steps of the correlation length this small, is the last."""
 
 FIRST_LOG_STEP = 0.7
 """First step of the correlation length, in ln."""
@@ -176,7 +172,9 @@ def fit_with_undeclared_heat(
             fit = _pass(fit, sizes, most_std, smoothing=True)
         return fit, sizes
 
-    started = [found for found in side_by_side([partial(begun, share) for share in START_SHARES]) if found is not None]
+    started = [
+        found for found in those_that_work([partial(begun, share) for share in START_SHARES]) if found is not None
+    ]
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
     return _settle(fit, sizes, n_passes, deadline)
 
@@ -195,15 +193,19 @@ def _settle(
     deadline: float = NO_DEADLINE,
 ) -> HeatFit:
     """Take passes until the likelihood no longer grows."""
-    refused = 0
+    problem, refused = fit.problem, 0
     for _ in range(n_passes):
         before, free = fit.log_likelihood, fit.free
         if is_late(deadline) and np.isfinite(before):
             break
         fit = _pass(fit, sizes, np.inf, still=refused >= MOST_REFUSED)
         refused = refused + 1 if np.array_equal(free, fit.free) else 0
-        if fit.log_likelihood - before < SETTLED_NATS and sizes.log_step < SETTLED_LOG_STEP:
-            break
+        if fit.log_likelihood - before < SETTLED_NATS:
+            reached = fit.log_likelihood
+            undeclared, value = sizes.settle_length(problem, fit.undeclared, fit.nominals, reached)
+            fit = replace(fit, undeclared=undeclared, log_likelihood=value)
+            if value - reached < SETTLED_NATS:
+                break
     return fit
 
 

@@ -1,9 +1,11 @@
 """How large the undeclared heat is: its size on each node and its correlation length, by maximum likelihood."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.optimize import BFGS
 
 from twin_core._typing import FloatArray
@@ -19,6 +21,9 @@ LONGEST_SHARE = 0.1
 
 SMALLEST_LOG_STEP, LARGEST_LOG_STEP = 0.1, 2.5
 """Of the correlation length, and of any size, from pass to pass, in ln."""
+
+SETTLED_NATS, SETTLED_LOG_STEP = 0.2, 0.3
+"""A pass that adds less than this to the log-likelihood, with steps of the correlation length this small, is the last."""
 
 N_ITERATIONS = 8
 """Of one pass: parameters move in between, so that no size need be final."""
@@ -50,6 +55,25 @@ class SizeSearch:
     ) -> tuple[UndeclaredHeat, float]:
         """Return a more likely size of the undeclared heat, and its log-likelihood."""
         best, value = self._along_the_slope(problem, undeclared, nominals)
+        return self._with_a_likelier_length(problem, best, nominals, value)
+
+    def settle_length(
+        self, problem: Problem, undeclared: UndeclaredHeat, nominals: Sequence[Nominal], value: float
+    ) -> tuple[UndeclaredHeat, float]:
+        """Return undeclared heat of a likelier correlation length, and its log-likelihood, from that of the given one.
+
+        Where nothing else moves any more steps of the length alone are tried, at a small part of the work of a pass, until they
+        are short or add something.
+        """
+        best, found = undeclared, value
+        while self.log_step >= SETTLED_LOG_STEP and found - value < SETTLED_NATS:
+            best, found = self._with_a_likelier_length(problem, best, nominals, found)
+        return best, found
+
+    def _with_a_likelier_length(
+        self, problem: Problem, best: UndeclaredHeat, nominals: Sequence[Nominal], value: float
+    ) -> tuple[UndeclaredHeat, float]:
+        """Return what is likelier a step of the length away, if anything is, and go on with a longer or shorter step."""
         moved = False
         for sign in (-1.0, 1.0):
             check_time()
@@ -70,11 +94,9 @@ class SizeSearch:
         It remembers from pass to pass how the slope changes, so that most take a step or none.
         """
         value, slope = log_likelihood_and_slope(problem, undeclared, nominals)
-        if self.curvature is None:
-            self.curvature = np.diag(np.maximum(np.abs(slope), 1.0))
         moved = np.zeros(slope.size)
         for iteration in range(N_ITERATIONS):
-            step = np.linalg.solve(self.curvature, slope)
+            step, self.curvature = self._newton_step(slope)
             step = np.clip(moved + step, -LARGEST_LOG_STEP, LARGEST_LOG_STEP) - moved
             promised = 0.5 * float(slope @ step)  # believed of a curvature that this pass has seen
             if np.abs(slope).max() < LEAST_SLOPE_NATS or (iteration > 0 and promised < LEAST_GAIN_NATS):
@@ -92,6 +114,18 @@ class SizeSearch:
             if not value - before > LEAST_GAIN_NATS:
                 break
         return undeclared, value
+
+    def _newton_step(self, slope: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the step that the slope asks for, and the curvature that it follows.
+
+        A curvature that is none is forgotten: a start was beyond all likelihood.
+        """
+        if self.curvature is not None:
+            with suppress(LinAlgError):
+                factor = cho_factor(self.curvature, check_finite=False)
+                return np.asarray(cho_solve(factor, slope, check_finite=False)), self.curvature
+        scale = np.maximum(np.abs(slope), 1.0)
+        return slope / scale, np.diag(scale)
 
 
 def _updated(curvature: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
