@@ -35,9 +35,10 @@ $(DOCS): $(STAMP)
 demo: $(STAMP)
 	$(BIN)/twin demo --out demo-out
 
-# Two processes, file by file: what a file sets up is set up once, and the long ones do not come last.
+# Three processes on two cores, as tests of the service wait, file by file: what a file sets up is set up once, and the long ones
+# do not come last. Threads within small matrix products wait for each other longer than they compute.
 # Python keeps its bytecode: the tests start hundreds of processes, each of which would compile the sources again.
-PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
 	$(PYTEST) -m "not long and not ground and not fleet"

@@ -5,6 +5,8 @@ The methods are looked up when asked for, so that reading a model file needs no 
 
 from collections.abc import Mapping, Sequence
 
+from threadpoolctl import threadpool_limits
+
 from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.errors import ModelError
@@ -72,7 +74,8 @@ def calibrate(
     else:
         from twin_core.calibrate.explained import calibrate_and_explain
 
-        model = calibrate_and_explain(spec, records, "huber" if loss == "huber" else "squared", deadline, progress)
+        with threadpool_limits(1):  # threads within so small products wait for each other longer than they compute
+            model = calibrate_and_explain(spec, records, "huber" if loss == "huber" else "squared", deadline, progress)
     progress(1.0, "calibrated")
     return model
 

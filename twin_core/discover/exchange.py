@@ -74,7 +74,7 @@ def _rivals(without: Trial, own: Effect) -> list[Effect]:
     """Return the best other names for an effect, with no more parameters, that act where it does on top of a trial without it."""
     survey, effects = candidates(without, without.fit, fallback=False)
     here, most = acts_at(without, (own,)), len(own.parameter_specs())
-    acting = {effect.place: acts_at(without, (effect,)) for effect in effects}
+    acting = {place: acts_at(without, (effect,)) for place, effect in {e.place: e for e in effects}.items()}
     effects = [
         effect
         for effect in effects
