@@ -1,5 +1,6 @@
 """Bijections between a physical value and the unbounded number that a solver moves."""
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -146,7 +147,7 @@ class Log:
 
     def to_value(self, free: float) -> float:
         """Return exp(free) within the bounds, held within e^-300 and e^300 so that a wild trial step stays a number."""
-        return max(min(float(np.exp(np.clip(free, -300.0, 300.0))), self.upper), self.lower)
+        return max(min(math.exp(min(max(free, -300.0), 300.0)), self.upper), self.lower)  # NumPy is slow with single numbers
 
     def to_free(self, value: float) -> float:
         """Return ln(value)."""
