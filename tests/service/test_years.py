@@ -147,8 +147,8 @@ def _hoard(progress: Any) -> None:
 
 
 def test_a_job_that_needs_too_much_memory_is_ended() -> None:
-    executor = ProcessPerTask(1, 600.0, 400.0)
-    with pytest.raises(JobFailed, match="400 MiB of memory"):
+    executor = ProcessPerTask(1, 600.0, 250.0)
+    with pytest.raises(JobFailed, match="250 MiB of memory"):
         executor.start(Task(_hoard)).result()
     executor.shutdown()
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from twin_core.calibrate.containment import attempted
 from twin_core.discover import policy
-from twin_core.discover.evidence import validate
+from twin_core.discover.evidence import paid, validate
 from twin_core.discover.trial import Trial, by_chance, explained, mean_excess
 
 
@@ -54,9 +54,39 @@ def times_asked(
     """
     amount = explained(simple, rich)
     if amount < asked and (alone := shown()) is not None:
-        told = attempted(lambda: validate(*alone).foresight, "what names foretell", [])
-        asked *= 1.0 if told is None else min(1.0, policy.DOMINANCE * told**2)
+        asked *= min(1.0, policy.DOMINANCE * _foresight(*alone) ** 2)
     return amount / asked if asked > 0.0 else np.inf
+
+
+def times_likely(simple: Trial, rich: Trial, shown: Callable[[], tuple[Trial, Trial] | None]) -> float:
+    """Return how many times as likely effects are as coarseness may look, by log Bayes factors; zero where they do not foretell.
+
+    Gradients within the nodes may take up all that a name explains, so that of its variance nothing is its own. What is really
+    there is likelier all the same, whatever the misfit is taken for: what trajectories leave wanders at the sensors, beside
+    gradients or without, and the less favourable of both counts. Coarseness looks likely by one of the two, mostly: gradients
+    take up what it does, or a name makes up for that alone. The unit is by how much the log-likelihood of so many readings
+    varies by chance.
+
+    Parameters
+    ----------
+    simple, rich, shown
+        As of :func:`times_asked`.
+    """
+    alone = shown()
+    if alone is None or not _foresight(*alone) < policy.FORESIGHT ** len(alone[1].effects):
+        return 0.0
+    gains = [rich.calibration().log_posterior - simple.calibration().log_posterior]
+    beside = simple.beside_gradients(), rich.beside_gradients()
+    if beside[0] is not None and beside[1] is not None:
+        gains.append(beside[1].log_posterior - beside[0].log_posterior)
+    chance = float(np.sqrt(rich.n_samples / 2.0))
+    return paid(min(gains), simple, rich, 1) / max(policy.DOMINANCE * chance, 1e-300)
+
+
+def _foresight(simple: Trial, rich: Trial) -> float:
+    """Return the error on what names were not fitted to, after over before; infinite where it cannot be computed."""
+    told = attempted(lambda: validate(simple, rich).foresight, "what names foretell", [])
+    return np.inf if told is None else told
 
 
 def stands(simple: Trial, rich: Trial) -> bool:

@@ -96,16 +96,24 @@ def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
 
 
 def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return evidence from a gain in log-likelihood: every parameter and every candidate tried is paid for.
+    """Return evidence from a gain in log-likelihood, see :func:`paid`."""
+    p_value = min(1.0, max(n_tried, 1) * float(chdtrc(_n_more(simple, rich), 2.0 * max(gain, 0.0))))
+    return Evidence(paid(gain, simple, rich, n_tried), p_value)
+
+
+def paid(gain: float, simple: Trial, rich: Trial, n_tried: int) -> float:
+    """Return a log Bayes factor from a gain in log-likelihood: every parameter and every candidate tried is paid for.
 
     An instant pays twice (Zhang and Siegmund, Biometrics 63 (2007) 22): it is one among all samples, and told to a few of them
     whatever their number.
     """
-    extra = max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)
-    paid = extra + max(_n_instants(rich) - _n_instants(simple), 0)
-    penalty = 0.5 * paid * np.log(max(rich.n_samples, 2)) + np.log(max(n_tried, 1))
-    p_value = min(1.0, max(n_tried, 1) * float(chdtrc(extra, 2.0 * max(gain, 0.0))))
-    return Evidence(float(gain - penalty), p_value)
+    n_paid = _n_more(simple, rich) + max(_n_instants(rich) - _n_instants(simple), 0)
+    return float(gain - 0.5 * n_paid * np.log(max(rich.n_samples, 2)) - np.log(max(n_tried, 1)))
+
+
+def _n_more(simple: Trial, rich: Trial) -> int:
+    """Return how many more parameters a trial has."""
+    return max(rich.fit.problem.n_free - simple.fit.problem.n_free, 1)
 
 
 def _n_instants(trial: Trial) -> int:

@@ -58,7 +58,8 @@ THRESHOLDS: dict[str, Threshold] = {
     "DOMINANCE": Threshold(
         "ratio",
         "a name explains so many times what a lumped network may leave beside it, times so many times the share of variance that"
-        " it leaves of what it was not fitted to where that is below one",
+        " it leaves of what it was not fitted to where that is below one; or it foretells, and is likelier whatever the misfit is"
+        " taken for, by so many times what chance makes of the log-likelihood of so many readings: sqrt(n / 2)",
         "a name that explains less than what stays could be the same coarseness; twice tells them apart within a factor sqrt 2",
         0.0,
         1.0,

@@ -9,7 +9,7 @@ import numpy as np
 from twin_core.calibrate.containment import those_that_work
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
-from twin_core.discover.coarseness import least_explained, times_asked
+from twin_core.discover.coarseness import least_explained, times_asked, times_likely
 from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
@@ -39,7 +39,8 @@ N_RECONSIDERED = 4
 def withdraw(state: Search, needed: float) -> None:
     """Withdraw what explains no more than a lumped network may leave: both may be its coarseness.
 
-    A finding must explain more than what stays beside it, and each of its effects more than any coarse network may have left.
+    A finding must explain more than what stays beside it, and each of its effects more than any coarse network may have left, or
+    be likelier by far whatever the misfit is taken for.
     Where the model fits to the noise nothing stays, and every finding stands. The weakest goes first: what it explained then
     counts as unexplained, unless the others explain it too; what is left of a set that lost a member is examined as any option.
     """
@@ -55,9 +56,7 @@ def withdraw(state: Search, needed: float) -> None:
             asked[places] = least_explained(state.trial.unexplained(), left, n_readings, is_named=places in named)
         without = _without_each(state, asked)
         told = {
-            places: times_asked(kept[0], state.trial, asked[places], partial(_alone, state, places, named))
-            for places, kept in without.items()
-            if kept
+            places: _times(state, kept[0], asked[places], places, named) for places, kept in without.items() if kept
         }
         weakest = min(told, key=lambda places: told[places], default=None)
         if weakest is None or told[weakest] >= 1.0:
@@ -73,6 +72,15 @@ def withdraw(state: Search, needed: float) -> None:
         _drop(state, weakest, *kept)
         for rest in filter(None, rests):
             _examine_again(state, rest, needed)
+
+
+def _times(
+    state: Search, without: Trial, asked: float, places: frozenset[object], named: Collection[frozenset[object]]
+) -> float:
+    """Return how many times as much as is asked of them the effects at places explain, or are likelier, beside all others."""
+    shown = partial(_alone, state, places, named)
+    times = times_asked(without, state.trial, asked, shown)
+    return times if times >= 1.0 else max(times, times_likely(without, state.trial, shown))
 
 
 def _alone(

@@ -61,13 +61,15 @@ class Fit:
 
 @dataclass
 class Stub:
-    """A trial of which only the excess and the number of its parameters count."""
+    """A trial of which only the excess, the number of its parameters and its likelihood along trajectories count."""
 
     effects: tuple[Effect, ...] = ()
     left: float = 0.0
     n_free: int = 3
     n_samples: int = N_READINGS
     foresight: float = 1.0
+    along: float = 0.0
+    beside: float | None = None
     fit: Fit = field(init=False)
 
     def __post_init__(self) -> None:
@@ -87,6 +89,12 @@ class Stub:
 
     def log_evidence(self) -> float:
         return 0.0
+
+    def calibration(self) -> Any:
+        return SimpleNamespace(log_posterior=self.along)
+
+    def beside_gradients(self) -> Any:
+        return None if self.beside is None else SimpleNamespace(log_posterior=self.beside)
 
 
 def stub(*effects: Effect, left: float = 0.0, n_free: int = 3, foresight: float = 1.0) -> Trial:

@@ -2,7 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.twin_core.discover.stubs import (
@@ -10,6 +12,7 @@ from tests.twin_core.discover.stubs import (
     JUST,
     LEAST,
     MOST,
+    N_READINGS,
     NEEDED,
     judged,
     load,
@@ -65,6 +68,41 @@ def test_what_foretells_has_less_to_explain(monkeypatch: pytest.MonkeyPatch, for
         assert bool(state.findings) == kept
     beside = stub(load("n1"), left=0.5 + DOMINANCE * LEAST - JUST)
     assert not stands(beside, stub(load("n1"), load("n0"), left=0.5, foresight=foresight))
+
+
+FAR = DOMINANCE * (N_READINGS / 2) ** 0.5 + 0.5 * float(np.log(N_READINGS))
+"""Gain in log-likelihood, one parameter paid, from which a name is no coarseness whatever it explains."""
+
+
+@pytest.mark.parametrize(
+    ("along", "beside", "foresight", "kept"),
+    [
+        (FAR + JUST, None, 0.9, True),
+        (FAR - JUST, None, 0.9, False),
+        (9.0 * FAR, FAR + JUST, 0.9, True),
+        (9.0 * FAR, FAR - JUST, 0.9, False),
+        (FAR - JUST, 9.0 * FAR, 0.9, False),
+        (9.0 * FAR, 9.0 * FAR, FORESIGHT, False),
+    ],
+    ids=["just", "too little", "both", "gradients take it up", "it makes up for gradients", "foretells nothing"],
+)
+def test_what_is_likelier_by_far_whatever_the_misfit_is_no_coarseness(
+    monkeypatch: pytest.MonkeyPatch, along: float, beside: float | None, foresight: float, kept: bool
+) -> None:
+    """Gradients within the nodes took up all that an undeclared coupling did, at 164 nats less, and nothing was its own."""
+    rich = of_likelihood(stub(load("n0"), left=0.5, foresight=foresight), along, beside)
+    simple = of_likelihood(stub(left=0.5), 0.0, None if beside is None else 0.0)
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    state = Search(rich, simple, findings=[Finding(judged("n0", 50.0))])
+    withdraw(state, NEEDED)
+    assert bool(state.findings) == kept
+    assert not stands(simple, rich)  # one that explains it goes before it where several pass
+
+
+def of_likelihood(trial: Trial, along: float, beside: float | None) -> Trial:
+    of: Any = trial
+    of.along, of.beside = along, beside
+    return trial
 
 
 @pytest.mark.parametrize(("foresight", "kept"), [(1.0, ["n1"]), (0.2, ["n0"])])
