@@ -33,8 +33,8 @@ six times what stayed in the end."""
 
 MOST_STEPS, MOST_STEPS_NEAR = 30, 10
 SETTLED_SHARE = 1e-3
-"""The fit ends where a step promises to lower the cost by no more, or does, or after so many, fewer where it starts near another
-one: a limit of time. Steps of Gauss and Newton that gain a thousandth leave less than a nat of ten thousand readings."""
+"""The fit ends where a step lowers the cost by no more, or after so many, fewer where it starts near another one: a limit of
+time. Steps of Gauss and Newton that gain a thousandth leave less than a nat of ten thousand readings."""
 
 LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e4
 """Of the diagonal of the Hessian (Levenberg and Marquardt)."""
@@ -154,11 +154,8 @@ def with_gradients(
     for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here)
-        promised = 0.5 * float(gradient @ _solved(hessian, gradient))
-        if steps >= LEAST_STEPS and before - promised > enough:
+        if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ _solved(hessian, gradient)) > enough:
             return None
-        if promised <= SETTLED_SHARE * before:
-            break
         while damping < MOST_DAMPING:
             step = _solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
             fit = problem.solve(here.unknowns + step, near=here.fit)
