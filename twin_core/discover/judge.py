@@ -324,8 +324,12 @@ def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
 
 
 def _hardly_shows(simple: Trial, trial: Trial, removed: float) -> bool:
-    """Return whether the temperatures of a repeatable heat are a small share of those that a name explains, and more stays."""
-    return removed <= min(policy.REPEATABLE_SHARE**2 * explained(simple, trial), trial.unexplained() - removed)
+    """Return whether the temperatures of a repeatable heat are a small share of those that a name explains, and more stays.
+
+    More by what chance leaves at least: where the name explains all, a heat that explains it as well is no small matter.
+    """
+    stays = trial.unexplained() - removed - by_chance(trial.n_samples)
+    return removed <= min(policy.REPEATABLE_SHARE**2 * explained(simple, trial), stays)
 
 
 def _little(simple: Trial, trial: Trial, removed: float) -> float:

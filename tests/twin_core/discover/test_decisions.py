@@ -303,8 +303,8 @@ NEARLY_ALL = REPEATABLE_SHARE**2 * (10.0 - 1.0)
         (NEARLY_ALL - JUST, None, 1.0, ""),
         (NEARLY_ALL + JUST, None, 1.0, SMALL_REMAINDER),
         (0.01, NEARLY_ALL + JUST, 1.0, SMALL_REMAINDER),
-        (0.5 - JUST, None, 9000.0, ""),
-        (0.5 + JUST, None, 9000.0, SMALL_REMAINDER),
+        (0.5 * (1.0 - CHANCE) - JUST, None, 9000.0, ""),
+        (0.5 * (1.0 - CHANCE) + JUST, None, 9000.0, SMALL_REMAINDER),
     ],
     ids=[
         *("a law", "little beside it", "little better", "beside it", "better", "as coarse as can be", "coarser"),
@@ -324,6 +324,17 @@ def test_what_a_name_leaves_is_weighed_against_what_it_removes(
     assert judge._merely_resembles(simple, option, NEEDED) == reason
     monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: True)
     assert judge._merely_resembles(simple, option, NEEDED) == ""
+
+
+@pytest.mark.parametrize("rounding", [-4e-16, 0.0, 4e-16])
+def test_a_heat_that_explains_as_much_as_a_name_that_leaves_nothing_is_an_objection(
+    monkeypatch: pytest.MonkeyPatch, rounding: float
+) -> None:
+    """A heater stood for a resonance by rounding alone: the curve in its place was likelier by 8 nats and left as little."""
+    monkeypatch.setattr(judge, "acts_at", lambda *arguments: {"a"})
+    monkeypatch.setattr(judge, "against_free_forms", lambda *arguments: (Repeatable(), rounding))
+    monkeypatch.setattr(judge, "more_is_left_elsewhere", lambda *arguments: False)
+    assert judge._merely_resembles(stub(left=10.0), judged("a", 32.0, left=0.0), NEEDED) == SMALL_REMAINDER
 
 
 def test_beside_much_that_stays_as_large_a_share_is_little(monkeypatch: pytest.MonkeyPatch) -> None:
