@@ -35,20 +35,20 @@ $(DOCS): $(STAMP)
 demo: $(STAMP)
 	$(BIN)/twin demo --out demo-out
 
-# Three processes on two cores, as tests of the service wait, file by file: what a file sets up is set up once, and the long ones
-# do not come last. Threads within small matrix products wait for each other longer than they compute.
+# File by file: what a file sets up is set up once, and the long ones do not come last. Three processes on two cores, for tests of
+# the service wait; searches do not. Threads within small matrix products wait for each other longer than they compute.
 # Python keeps its bytecode: the tests start hundreds of processes, each of which would compile the sources again.
-PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest --dist loadfile --no-loadscope-reorder
 
 test: $(STAMP)
-	$(PYTEST) -m "not long and not ground and not fleet"
+	$(PYTEST) -n 3 -m "not long and not ground and not fleet"
 
 # The demonstration, the quick start and the operator's guide, as they are printed, and searches of more than twenty seconds.
 test-long: $(STAMP)
-	$(PYTEST) -m long
+	$(PYTEST) -n 2 -m long
 
 test-fast: $(STAMP)
-	$(PYTEST) -m "not slow and not long and not e2e and not browser and not ground and not fleet"
+	$(PYTEST) -n 3 -m "not slow and not long and not e2e and not browser and not ground and not fleet"
 
 # Several processes on PostgreSQL, and their faults.
 test-fleet: $(STAMP)
@@ -56,7 +56,7 @@ test-fleet: $(STAMP)
 
 # On PostgreSQL every test of the service that starts no process of its own.
 test-postgres: $(STAMP)
-	TWIN_TEST_STORE=postgres $(PYTEST) -m "not fleet and not long and not e2e and not browser and not ground" tests/service
+	TWIN_TEST_STORE=postgres $(PYTEST) -n 3 -m "not fleet and not long and not e2e and not browser and not ground" tests/service
 
 check: $(STAMP)
 	$(BIN)/ruff format --check .
