@@ -74,19 +74,29 @@ def as_pdf(page: Path, out: Path) -> None:
 def _ended(command: Sequence[str], limit_s: float) -> bool:
     """Run a command and return whether it ended by itself in time; neither it nor what it started outlives the call.
 
-    A termination of this process interrupts the wait as Ctrl-C does.
+    A termination of this process interrupts the wait as Ctrl-C does. One that comes before the command is known would leave it
+    behind, and is held back until then.
     """
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    process = subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
-    )
+    unheld = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))
+    process = None
     try:
+        process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        signal.pthread_sigmask(signal.SIG_SETMASK, unheld)
         process.wait(limit_s)
     except subprocess.TimeoutExpired:
         return False
     finally:
-        with suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        signal.pthread_sigmask(signal.SIG_SETMASK, unheld)
         signal.signal(signal.SIGTERM, before)
     return True

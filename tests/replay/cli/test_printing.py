@@ -85,3 +85,20 @@ def test_a_browser_does_not_outlive_who_started_it(desk: Path) -> None:
     twin.send_signal(signal.SIGTERM)
     assert twin.wait(60) == 130
     assert not is_running(int((desk / "started").read_text()))
+
+
+def test_a_termination_while_the_browser_starts_leaves_none_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a busy machine a browser ran before its process was known, and outlived a termination that came then."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    class Slow(subprocess.Popen[bytes]):
+        def __init__(self, *command: object, **options: object) -> None:
+            super().__init__(*command, **options)  # type: ignore[call-overload]
+            started.append(self)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(subprocess, "Popen", Slow)
+    with pytest.raises(KeyboardInterrupt):
+        printing._ended(["sleep", "600"], 60.0)
+    assert started[0].poll() is not None
+    assert signal.getsignal(signal.SIGTERM) is not signal.default_int_handler
