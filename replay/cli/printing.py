@@ -75,11 +75,17 @@ def _ended(command: Sequence[str], limit_s: float) -> bool:
     """Run a command and return whether it ended by itself in time; neither it nor what it started outlives the call.
 
     A termination of this process interrupts the wait as Ctrl-C does. One that comes before the command is known would leave it
-    behind, and is held back until then.
+    behind, and counts as soon as it is.
     """
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    unheld = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGTERM, signal.SIGINT))
-    process = None
+    process: subprocess.Popen[bytes] | None = None
+    arrived: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        arrived.append(number)
+        if process is not None:
+            raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         process = subprocess.Popen(
             command,
@@ -88,7 +94,8 @@ def _ended(command: Sequence[str], limit_s: float) -> bool:
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        signal.pthread_sigmask(signal.SIG_SETMASK, unheld)
+        if arrived:
+            raise KeyboardInterrupt
         process.wait(limit_s)
     except subprocess.TimeoutExpired:
         return False
@@ -97,6 +104,6 @@ def _ended(command: Sequence[str], limit_s: float) -> bool:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-        signal.pthread_sigmask(signal.SIG_SETMASK, unheld)
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return True

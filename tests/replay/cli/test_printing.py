@@ -101,4 +101,4 @@ def test_a_termination_while_the_browser_starts_leaves_none_behind(monkeypatch: 
     with pytest.raises(KeyboardInterrupt):
         printing._ended(["sleep", "600"], 60.0)
     assert started[0].poll() is not None
-    assert signal.getsignal(signal.SIGTERM) is not signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
