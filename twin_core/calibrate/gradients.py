@@ -176,6 +176,7 @@ def with_gradients(
         ),
     )
     fit = replace(here.fit, cost=here.cost - 0.5 * float(((here.biot / BIOT) ** 2).sum()))
+    # The Hessian is that of the last step: another evaluation would tell no more to anybody.
     found = Optimum(here.unknowns, fit, hessian[: problem.n_unknowns, : problem.n_unknowns], "converged", 0)
     whitener = fit_whitener(of_mean, left_K)
     against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())

@@ -55,8 +55,8 @@ N_VARIED = 6
 """Settings from which each name is fitted that acts where the finding does: a thermostat is easily caught at wrong switchings."""
 
 HOPELESS_NATS = 10.0
-"""Names that are so much less likely than is asked for, fitted from the simpler model's heat, are not fitted from their own
-trajectories too: of 31 that were not supported either way, these ended 7 nats higher at most."""
+"""A limit of time. Names that are so much less likely than is asked for, fitted from the simpler model's heat, are not fitted
+from their own trajectories too: of 31 that were not supported either way, these ended 7 nats higher at most."""
 
 
 def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, needed: float) -> Finding:

@@ -147,9 +147,8 @@ class Log:
 
     def to_value(self, free: float) -> float:
         """Return exp(free) within the bounds, held within e^-300 and e^300 so that a wild trial step stays a number."""
-        return max(
-            min(math.exp(min(max(free, -300.0), 300.0)), self.upper), self.lower
-        )  # NumPy is slow with single numbers
+        value = math.exp(min(max(free, -300.0), 300.0))  # NumPy is slow with single numbers
+        return max(min(value, self.upper), self.lower)
 
     def to_free(self, value: float) -> float:
         """Return ln(value)."""

@@ -255,3 +255,17 @@ def test_what_a_search_of_sizes_remembers_wrongly_does_not_hold_it_up(curvature:
         before, (found, value) = value, sizes.improve(problem, found, fit.nominals)
         assert value >= before
     assert value > fit.log_likelihood - 0.2
+
+
+def test_a_first_start_that_fails_at_the_deadline_is_a_numerical_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing but that ends a candidate and not the run: there is no second start after the deadline."""
+
+    def fails(*arguments: object, **options: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    problem, _ = three_nodes(2, 20.0)
+    monkeypatch.setattr("twin_core.calibrate.undeclared.fit._pass", fails)
+    with pytest.raises(ArithmeticError):
+        fit_with_undeclared_heat(problem, deadline=0.0)
+    with pytest.raises(np.linalg.LinAlgError):
+        fit_with_undeclared_heat(problem)

@@ -175,6 +175,8 @@ def fit_with_undeclared_heat(
     started = [
         found for found in those_that_work([partial(begun, share) for share in START_SHARES]) if found is not None
     ]
+    if not started:
+        raise ArithmeticError("the first start failed, and there was no time for another")
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
     return _settle(fit, sizes, n_passes, deadline)
 
