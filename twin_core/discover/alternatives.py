@@ -6,7 +6,6 @@ itself hardly tells from the best one.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain
 
@@ -30,12 +29,12 @@ from twin_core.discover.trajectories import starts_beside_gradients
 from twin_core.discover.trial import (
     Trial,
     about_trajectory,
+    bare,
     by_chance,
     explained,
     mean_excess,
     resettled,
     resettled_near,
-    shared_unknowns,
     try_on_trajectories,
 )
 from twin_core.effects.base import Effect, Place
@@ -81,13 +80,13 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     known = {e.place for option in (finding.judged, *finding.alternatives) for e in option.effects}
     goal = _cost_of_explaining(simple, state.trial, least)
     fitted_before, found = simple.calibration(), state.trial.calibration()
-    bare = state.attempt(partial(_bare, simple, found), "the parameters found, without " + own.label) or fitted_before
+    start = state.attempt(partial(bare, simple, found), "the parameters found, without " + own.label) or fitted_before
     what = f"names that may explain what {own.label} does"
-    near = state.attempt(partial(_near, simple, bare, found, own, known), what) or []
+    near = state.attempt(partial(_near, simple, start, found, own, known), what) or []
     before = state.attempt(partial(_near_before, simple, own, known), what) or []
     beside = state.attempt(partial(_near_beside_gradients, simple, own, known), what) or []
     options = [
-        *((effect, [bare]) for effect in near),
+        *((effect, [start]) for effect in near),
         *((effect, [fitted_before]) for effect in before),
         *((effect, starts_beside_gradients(simple)) for effect in beside),
     ]
@@ -163,24 +162,6 @@ def _near_before(simple: Trial, own: Effect, known: Collection[Place]) -> list[E
         others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= least]
         chosen += refined(about, others[:N_BEFORE])
     return each_start(chosen)
-
-
-def _bare(simple: Trial, found: Calibration) -> Calibration:
-    """Return the model without a finding at the parameters that it has with it: all that is missing there is what was found.
-
-    Fitted without it, parameters make up for it as well as they can, and far from there nothing answers linearly.
-
-    Raises
-    ------
-    ArithmeticError
-        Where it has no solution there.
-    """
-    problem = simple.fit.problem
-    unknowns = found.optimum.unknowns[shared_unknowns(found.problem, problem)]
-    fit = problem.solve(unknowns)
-    if not np.isfinite(fit.cost):
-        raise ArithmeticError("the heat balance has no solution there")
-    return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
 
 
 def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place]) -> list[Effect]:

@@ -29,6 +29,7 @@ from twin_core.discover.judge import (
     threshold,
     worth,
 )
+from twin_core.discover.restart import restart
 from twin_core.discover.revision import prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
@@ -118,6 +119,7 @@ def search(
             if not _extend(state, needed, fallback=False):
                 break
         complete(state, needed)
+        restart(state)
         _converge(state)
         prune(state, needed)
         exchange(state, needed)
@@ -161,6 +163,7 @@ def _look_beside_gradients(state: Search, needed: float) -> None:
     what = "candidates beside gradients within the nodes"
     if state.attempt(partial(extend_beside_gradients, state, needed), what):
         complete(state, needed)
+        restart(state)
         _converge(state)
         prune(state, needed)
 

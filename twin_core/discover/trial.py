@@ -337,6 +337,24 @@ def try_on_trajectories(
     return Trial(fitted_effects(effects, values), fit, base.max_step_s, (optimum,), below=base)
 
 
+def bare(simple: Trial, found: Calibration) -> Calibration:
+    """Return the model without a finding at the parameters that it has with it: all that is missing there is what was found.
+
+    Fitted without it, parameters make up for it as well as they can, and far from there nothing answers linearly.
+
+    Raises
+    ------
+    ArithmeticError
+        Where it has no solution there.
+    """
+    problem = simple.fit.problem
+    unknowns = found.optimum.unknowns[shared_unknowns(found.problem, problem)]
+    fit = problem.solve(unknowns)
+    if not np.isfinite(fit.cost):
+        raise ArithmeticError("the heat balance has no solution there")
+    return replace(found, problem=problem, optimum=replace(found.optimum, unknowns=unknowns, fit=fit))
+
+
 def resettled(simple: Trial, rich: Trial) -> Trial:
     """Return a trial that was fitted on trajectories with its parameters fitted in the presence of undeclared heat too.
 

@@ -36,7 +36,7 @@ class Fits:
         self.simple.present_effects, self.simple.calibration = (), lambda: "fitted"
         self.found = self.with_a(LEFT)
         for name, value in {
-            "_bare": lambda simple, found: "bare",
+            "bare": lambda simple, found: "bare",
             "_near": lambda *given: [load("b")],
             "_near_before": lambda *given: [load("b")],
             "_near_beside_gradients": lambda *given: [load(node) for node in self.beside],

@@ -85,7 +85,7 @@ def test_gradients_are_asked_where_nothing_is_found_and_before_a_heat_without_a_
         asked.append("beside")
         return beside and find(state)
 
-    for name in ("_converge", "complete", "prune", "withdraw", "reconsider", "tell_alternatives"):
+    for name in ("_converge", "complete", "restart", "prune", "withdraw", "reconsider", "tell_alternatives"):
         monkeypatch.setattr(searching, name, lambda state, *needed: None)
     monkeypatch.setattr(searching, "_extend", extend)
     monkeypatch.setattr(searching, "extend_beside_gradients", look)
