@@ -16,7 +16,7 @@ import pytest
 
 from twin_core import side_by_side as module
 from twin_core._typing import FloatArray
-from twin_core.discover.once import ask_each, keep, known, once
+from twin_core.once import ask_each, keep, known, once
 from twin_core.side_by_side import ahead, both, side_by_side
 
 pytestmark = pytest.mark.skipif(not module.CAN_FORK, reason="this system does not fork safely")

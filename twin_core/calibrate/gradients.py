@@ -7,12 +7,12 @@ sound up to a Biot number of 0.1 (Incropera et al., Fundamentals of Heat and Mas
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import LinAlgError, block_diag, cho_factor, cho_solve
+from scipy.linalg import block_diag
 
 from twin_core._typing import FloatArray, IntArray
+from twin_core.calibrate.likeliest import greatest_log_posterior, of_sensor, solved
 from twin_core.calibrate.optimise import Optimum
 from twin_core.calibrate.problem import Fit, Problem, Segment
 from twin_core.calibrate.residual_noise import Whitener, fit_whitener, sensor_jacobians
@@ -86,7 +86,7 @@ class WithGradients:
             hessian[np.ix_(own, own)] += rows.T @ rows
         if not np.isfinite(hessian).all():
             raise ArithmeticError("the sensitivities are not finite")
-        return _solved(hessian, np.eye(len(hessian), n))[:n]
+        return solved(hessian, np.eye(len(hessian), n))[:n]
 
     @property
     def residuals(self) -> list[FloatArray]:
@@ -154,10 +154,10 @@ def with_gradients(
     for steps in range(MOST_STEPS if near is None else MOST_STEPS_NEAR):
         before = here.cost
         hessian, gradient = _equations(problem, optimum, here)
-        if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ _solved(hessian, gradient)) > enough:
+        if steps >= LEAST_STEPS and here.cost - 0.5 * float(gradient @ solved(hessian, gradient)) > enough:
             return None
         while damping < MOST_DAMPING:
-            step = _solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
+            step = solved(hessian + damping * np.diag(np.diag(hessian)), -gradient)[: problem.n_unknowns]
             fit = problem.solve(here.unknowns + step, near=here.fit)
             there = at(here.unknowns + step, fit) if np.isfinite(fit.cost) else here
             if there.cost < here.cost:
@@ -179,27 +179,23 @@ def with_gradients(
     # The Hessian is that of the last step: another evaluation would tell no more to anybody.
     found = Optimum(here.unknowns, fit, hessian[: problem.n_unknowns, : problem.n_unknowns], "converged", 0)
     whitener = fit_whitener(of_mean, left_K)
-    against = 0.5 * float((((here.unknowns - mean) / std) ** 2).sum() + ((here.biot / BIOT) ** 2).sum())
-    against += 0.5 * (problem.n_unknowns - problem.n_free) * float(np.log(problem.n_samples))
-    log_posterior = whitener.log_likelihood - against - _averaged(whitener, here.flows_K)
-    biot = tuple(here.biot[own] for own in _of_sensor(here.flows_K))
+    plain = replace(optimum, unknowns=here.unknowns, fit=here.fit)
+    log_posterior = greatest_log_posterior(
+        problem, plain, lambda u, f: heat_flows_K(problem, u, f, conductance), here.biot, BIOT
+    )
+    biot = tuple(here.biot[own] for own in of_sensor(here.flows_K))
     return WithGradients(of_mean, found, whitener, biot, log_posterior, here.flows_K)
-
-
-def _of_sensor(flows_K: list[FloatArray]) -> list[slice]:
-    """Return where the b_l of each sensor stand among all."""
-    return [slice(a, b) for a, b in pairwise(np.cumsum([0, *(flows.shape[1] for flows in flows_K)]))]
 
 
 def _equations(problem: Problem, optimum: Optimum, here: _Point) -> tuple[FloatArray, FloatArray]:
     """Return Hessian (Gauss and Newton) and gradient of the cost over unknowns and all b_l."""
-    of_sensor = _of_sensor(here.flows_K)
+    where = of_sensor(here.flows_K)
     mean, std = problem.prior()
     hessian = block_diag(np.diag(1.0 / std**2), np.eye(here.biot.size) / BIOT**2)
     gradient = np.concatenate([(here.unknowns - mean) / std**2, here.biot / BIOT**2])
     for sensor, jacobian in sensor_jacobians(problem, replace(optimum, unknowns=here.unknowns, fit=here.fit)):
         seen = np.isfinite(here.left_K[:, sensor])
-        own = np.r_[0 : problem.n_unknowns, problem.n_unknowns + np.arange(here.biot.size)[of_sensor[sensor]]]
+        own = np.r_[0 : problem.n_unknowns, problem.n_unknowns + np.arange(here.biot.size)[where[sensor]]]
         rows = np.hstack([jacobian, here.flows_K[sensor]])[seen] / problem.noise_K[sensor]
         hessian[np.ix_(own, own)] += rows.T @ rows
         gradient[own] -= rows.T @ (here.left_K[seen, sensor] / problem.noise_K[sensor])
@@ -212,34 +208,13 @@ def _beside_gradients(problem: Problem, fit: Fit, flows_K: list[FloatArray]) -> 
     """Return what a fit leaves beside the gradients that explain most of it, (n_rows, n_sensors), and their b_l."""
     left_K = np.concatenate(problem.residuals(fit))
     biot = np.zeros(sum(flows.shape[1] for flows in flows_K))
-    for sensor, (flows, own) in enumerate(zip(flows_K, _of_sensor(flows_K), strict=True)):
+    for sensor, (flows, own) in enumerate(zip(flows_K, of_sensor(flows_K), strict=True)):
         seen = np.isfinite(left_K[:, sensor])
         rows = flows[seen] / problem.noise_K[sensor]
         hessian = rows.T @ rows + np.eye(flows.shape[1]) / BIOT**2
-        biot[own] = _solved(hessian, rows.T @ (left_K[seen, sensor] / problem.noise_K[sensor]))
+        biot[own] = solved(hessian, rows.T @ (left_K[seen, sensor] / problem.noise_K[sensor]))
         left_K[:, sensor] -= flows @ biot[own]
     return left_K, biot
-
-
-def _averaged(whitener: Whitener, flows_K: list[FloatArray]) -> float:
-    """Return what the mean over all b_l costs beside the likeliest ones: ln of the share that the readings leave (Laplace)."""
-    total = 0.0
-    for sensor, flows in enumerate(flows_K):
-        rows = BIOT * whitener.whiten(sensor, flows)
-        total += 0.5 * float(np.linalg.slogdet(np.eye(flows.shape[1]) + rows.T @ rows)[1])
-    return total
-
-
-def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve positive definite equations, every unknown scaled alike; ArithmeticError where they are not."""
-    if not right.size:
-        return right
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    by_row = scale if right.ndim == 1 else scale[:, None]
-    try:
-        return np.asarray(cho_solve(cho_factor(matrix * scale[:, None] * scale), right * by_row) * by_row)
-    except LinAlgError as error:
-        raise ArithmeticError("the readings do not tell the unknowns apart") from error
 
 
 def conductances_W_per_K(problem: Problem, unknowns: FloatArray, fit: Fit) -> FloatArray:

@@ -10,6 +10,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Progress, no_progress
 from twin_core.calibrate.approach import approach, coarse_problem
 from twin_core.calibrate.containment import NO_DEADLINE, attempted, is_late
+from twin_core.calibrate.likeliest import greatest_log_posterior
 from twin_core.calibrate.multistart import best_of_starts
 from twin_core.calibrate.noise import noise_beside_K, sensor_noise_K
 from twin_core.calibrate.optimise import ADVICE, Optimum, minimise
@@ -23,6 +24,7 @@ from twin_core.errors import NoSolutionError, TelemetryError
 from twin_core.network.model import Network, build_network
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
+from twin_core.once import once
 from twin_core.side_by_side import both
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -61,16 +63,10 @@ class Calibration:
         return self.problem.network.with_values(self.problem.values(self.optimum.unknowns))
 
     @property
+    @once
     def log_posterior(self) -> float:
-        """Log-likelihood of the residuals under their own coloured noise, less what priors hold against the parameters.
-
-        Initial temperatures are fitted here: each pays its Schwarz penalty, so that the value stands beside likelihoods
-        that are averaged over them.
-        """
-        mean, std = self.problem.prior()
-        against = 0.5 * float((((self.optimum.unknowns - mean) / std) ** 2).sum())
-        starts = self.problem.n_unknowns - self.problem.n_free
-        return self.whitener.log_likelihood - against - 0.5 * starts * float(np.log(self.problem.n_samples))
+        """Greatest log-likelihood of trajectories under their own coloured noise, less what priors hold against parameters."""
+        return greatest_log_posterior(self.problem, self.optimum)
 
     @property
     def residuals(self) -> list[FloatArray]:

@@ -10,8 +10,8 @@ from twin_core._typing import FloatArray
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
 from twin_core.discover.left_out import forward_error
-from twin_core.discover.once import ask_each
 from twin_core.discover.trial import Trial
+from twin_core.once import ask_each
 from twin_core.side_by_side import side_by_side
 
 CONSIDERABLE = 0.1

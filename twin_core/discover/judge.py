@@ -14,11 +14,11 @@ from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import at_an_end, coinciding_channel
 from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
-from twin_core.discover.once import keep, known
 from twin_core.discover.trial import Trial, by_chance, explained
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
+from twin_core.once import keep, known
 from twin_core.side_by_side import ahead
 from twin_core.simulate.rollout import hurried
 

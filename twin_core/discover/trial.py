@@ -18,9 +18,9 @@ from twin_core.calibrate.undeclared.model import HeatFit, linearise, log_likelih
 from twin_core.calibrate.undeclared.size import first_size
 from twin_core.discover import policy
 from twin_core.discover.left_out import blocked_errors, forward_error
-from twin_core.discover.once import once
 from twin_core.effects.base import Effect
 from twin_core.network.model import build_network
+from twin_core.once import once
 
 LN_2, LN_3 = np.log([2.0, 3.0]).tolist()
 

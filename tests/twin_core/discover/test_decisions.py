@@ -37,7 +37,6 @@ from twin_core.discover.judge import (
     simplest_first,
     threshold,
 )
-from twin_core.discover.once import once
 from twin_core.discover.policy import (
     ALTERNATIVE_NATS,
     DOMINANCE,
@@ -52,6 +51,7 @@ from twin_core.discover.trial import Trial
 from twin_core.discover.wald import score_needed
 from twin_core.effects import REGISTRY
 from twin_core.effects.base import Effect
+from twin_core.once import once
 
 pytestmark = pytest.mark.usefixtures("foreseen")
 

@@ -42,7 +42,8 @@ def best_start(name: str, where: Any) -> Effect:
 def found(*names: str, together: bool) -> Search:
     """Return a search that has found effects at the leak under some names, and the sensor's step, at once or one by one."""
     case, base = leaking()
-    step = best_start("sensor_bias", {"sensor": case.spec.sensors[-1]})
+    onset_s = 0.6 * float(case.record.time_s[-1])
+    step = best_start("sensor_bias", {"sensor": case.spec.sensors[-1]}).with_values({"b_K": BIAS_K, "time": onset_s})
     heats = [best_start(name, case.where) for name in names]
     trial = try_effects(base, (*heats, step), n_passes=12)
     sets = [trial.effects] if together else [(effect,) for effect in trial.effects]
