@@ -181,7 +181,7 @@ def with_gradients(
     whitener = fit_whitener(of_mean, left_K)
     plain = replace(optimum, unknowns=here.unknowns, fit=here.fit)
     log_posterior = greatest_log_posterior(
-        problem, plain, lambda u, f: heat_flows_K(problem, u, f, conductance), here.biot, BIOT
+        problem, plain, whitener, lambda u, f: heat_flows_K(problem, u, f, conductance), here.biot, BIOT
     )
     biot = tuple(here.biot[own] for own in of_sensor(here.flows_K))
     return WithGradients(of_mean, found, whitener, biot, log_posterior, here.flows_K)

@@ -45,6 +45,7 @@ class _Point:
 def greatest_log_posterior(
     problem: Problem,
     optimum: Optimum,
+    whitener: Whitener,
     columns: Flows | None = None,
     amounts: FloatArray | None = None,
     spread: float = 1.0,
@@ -58,6 +59,8 @@ def greatest_log_posterior(
     ----------
     problem, optimum
         A network fitted to open-loop trajectories, where the climb starts.
+    whitener
+        The noise of what is left there.
     columns
         What may be added to the predictions of each sensor.
     amounts
@@ -72,15 +75,15 @@ def greatest_log_posterior(
     n_rows, n_sensors = sum(s.record.time_s.size for s in problem.segments), problem.network.sensor_node.size
     n_starts = problem.n_unknowns - problem.n_free
 
-    def at(unknowns: FloatArray, fit: Fit, amounts: FloatArray) -> _Point:
+    def at(unknowns: FloatArray, fit: Fit, amounts: FloatArray, near: Whitener | None) -> _Point:
         added = columns(unknowns, fit) if columns is not None else [np.zeros((n_rows, 0))] * n_sensors
         left_K = np.concatenate(problem.residuals(fit))
         for sensor, (own, where) in enumerate(zip(added, of_sensor(added), strict=True)):
             left_K[:, sensor] -= own @ amounts[where]
-        whitener = fit_whitener(problem, np.split(left_K, ends))
+        noise = whitener if near is None else fit_whitener(problem, np.split(left_K, ends), near)
         against = 0.5 * float((((unknowns - mean) / std) ** 2).sum() + ((amounts / spread) ** 2).sum())
-        against += 0.5 * n_starts * float(np.log(problem.n_samples)) + averaged(whitener, added, spread)
-        return _Point(unknowns, fit, amounts, added, left_K, whitener, whitener.log_likelihood - against)
+        against += 0.5 * n_starts * float(np.log(problem.n_samples)) + averaged(noise, added, spread)
+        return _Point(unknowns, fit, amounts, added, left_K, noise, noise.log_likelihood - against)
 
     def climbed(here: _Point) -> _Point:
         step = _step(problem, optimum, here, mean, std, spread)
@@ -89,12 +92,12 @@ def greatest_log_posterior(
             fit = problem.solve(unknowns, near=here.fit)
             if not np.isfinite(fit.cost):
                 continue
-            there = at(unknowns, fit, here.amounts + share * step[problem.n_unknowns :])
+            there = at(unknowns, fit, here.amounts + share * step[problem.n_unknowns :], here.whitener)
             if there.log_posterior > here.log_posterior and there.whitener.valid.sum() == here.whitener.valid.sum():
                 return there
         return here
 
-    here = at(optimum.unknowns, optimum.fit, np.zeros(0) if amounts is None else amounts)
+    here = at(optimum.unknowns, optimum.fit, np.zeros(0) if amounts is None else amounts, None)
     for _ in range(MOST_STEPS):
         check_time()
         there = attempted(partial(climbed, here), "trajectories at their greatest likelihood", [])

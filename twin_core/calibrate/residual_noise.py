@@ -54,19 +54,23 @@ def one_axis(problem: Problem) -> FloatArray:
     return np.concatenate([t + i * gap for i, t in enumerate(spans)])
 
 
-def fit_whitener(problem: Problem, residuals: Sequence[FloatArray]) -> Whitener:
+def fit_whitener(problem: Problem, residuals: Sequence[FloatArray], near: Whitener | None = None) -> Whitener:
     """Return the noise models of the residuals of a problem, (n_samples, n_sensors) per segment.
 
-    Quantisation and the sensors' white noise are a floor: a residual cannot be whiter than its sensor.
+    With ``near``, the noise of residuals that hardly differ, each is climbed from there alone. Quantisation and the sensors'
+    white noise are a floor: a residual cannot be whiter than its sensor.
     """
     time_s, stacked = one_axis(problem), np.concatenate(list(residuals))
-    models = tuple(_fitted(time_s, stacked[:, s], 0.7 * float(problem.noise_K[s])) for s in range(stacked.shape[1]))
+    models = tuple(
+        _fitted(time_s, column, 0.7 * float(noise), None if near is None else near.models[s])
+        for s, (column, noise) in enumerate(zip(stacked.T, problem.noise_K, strict=True))
+    )
     return Whitener(time_s, np.isfinite(stacked), models)
 
 
-def _fitted(time_s: FloatArray, residual: FloatArray, floor_K: float) -> ResidualNoise:
+def _fitted(time_s: FloatArray, residual: FloatArray, floor_K: float, near: ResidualNoise | None) -> ResidualNoise:
     """Return the noise of one sensor; white noise as large as what is left where the fit of a coloured one fails."""
-    found = attempted(lambda: fit(time_s, residual, white_floor=floor_K), "residual noise", [])
+    found = attempted(lambda: fit(time_s, residual, white_floor=floor_K, near=near), "residual noise", [])
     if found is not None:
         return found
     seen = residual[np.isfinite(residual)]

@@ -66,7 +66,7 @@ class Calibration:
     @once
     def log_posterior(self) -> float:
         """Greatest log-likelihood of trajectories under their own coloured noise, less what priors hold against parameters."""
-        return greatest_log_posterior(self.problem, self.optimum)
+        return greatest_log_posterior(self.problem, self.optimum, self.whitener)
 
     @property
     def residuals(self) -> list[FloatArray]:

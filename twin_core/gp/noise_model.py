@@ -167,7 +167,9 @@ def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> 
     return total, gradient
 
 
-def fit(time_s: FloatArray, residual: FloatArray, *, white_floor: float) -> ResidualNoise:
+def fit(
+    time_s: FloatArray, residual: FloatArray, *, white_floor: float, near: ResidualNoise | None = None
+) -> ResidualNoise:
     """Fit the noise of one sensor by maximum likelihood.
 
     Parameters
@@ -178,6 +180,8 @@ def fit(time_s: FloatArray, residual: FloatArray, *, white_floor: float) -> Resi
         Measured - modelled, of zero mean; NaN where missing.
     white_floor
         Smallest standard deviation of the white part (quantisation, declared noise), positive.
+    near
+        The noise of a residual that hardly differs: where it has a coloured part the climb starts there alone.
 
     Returns
     -------
@@ -200,7 +204,7 @@ def fit(time_s: FloatArray, residual: FloatArray, *, white_floor: float) -> Resi
     white = _fit_white(times, series, white_floor)
     if series.size < 4:
         return white
-    coloured = _fit_coloured(times, series, white_floor, white.sigma_white)
+    coloured = _fit_coloured(times, series, white_floor, white.sigma_white, near)
     return coloured if coloured.log_likelihood > white.log_likelihood + COLOUR_MUST_GAIN else white
 
 
@@ -211,8 +215,10 @@ def _fit_white(times: FloatArray, series: FloatArray, floor: float) -> ResidualN
     return ResidualNoise(0.0, length, sigma, float(total))
 
 
-def _fit_coloured(times: FloatArray, series: FloatArray, floor: float, spread: float) -> ResidualNoise:
-    """Climb from several lengths; bounds keep every parameter where the data can speak of it."""
+def _fit_coloured(
+    times: FloatArray, series: FloatArray, floor: float, spread: float, near: ResidualNoise | None
+) -> ResidualNoise:
+    """Climb from several lengths, or from noise nearby; bounds keep every parameter where the data can speak of it."""
     steps = np.diff(times)
     span, step = float(times[-1] - times[0]), float(np.median(steps))
     bounds = [
@@ -228,6 +234,8 @@ def _fit_coloured(times: FloatArray, series: FloatArray, floor: float, spread: f
     differences = max(float(np.std(np.diff(series))) / np.sqrt(2.0), floor)
     low, high = np.array(bounds).T
     grid = [[spread, guess * step, share * differences] for guess in LENGTH_STARTS for share in WHITE_STARTS]
+    if near is not None and near.sigma_ou > 0.0:
+        grid = [[near.sigma_ou, near.length_s, near.sigma_white]]
     starts = sorted((np.clip(np.log(point), low, high) for point in grid), key=lambda point: objective(point)[0])
     climbs = [
         minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})

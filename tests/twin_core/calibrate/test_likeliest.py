@@ -96,7 +96,7 @@ def test_columns_of_no_weight_change_nothing() -> None:
     calibration = calibrated(1.5)
     columns = [np.sin(np.arange(N))[:, None]]
     with_some = greatest_log_posterior(
-        calibration.problem, calibration.optimum, lambda u, f: columns, np.zeros(1), spread=1e-9
+        calibration.problem, calibration.optimum, calibration.whitener, lambda u, f: columns, np.zeros(1), spread=1e-9
     )
     assert with_some == pytest.approx(calibration.log_posterior, abs=1e-3)
 
@@ -107,8 +107,9 @@ def test_a_column_that_the_readings_hold_is_found() -> None:
     problem, column = calibration.problem, np.cos(1.3 * np.arange(N))
     segment = problem.segments[0]
     told = replace(problem, segments=(replace(segment, measured_K=segment.measured_K + 0.5 * column[:, None]),))
-    found = greatest_log_posterior(told, calibration.optimum, lambda u, f: [column[:, None]], np.zeros(1), spread=1.0)
-    without = greatest_log_posterior(problem, calibration.optimum)
+    noise = fit_whitener(told, told.residuals(calibration.optimum.fit))
+    found = greatest_log_posterior(told, calibration.optimum, noise, lambda u, f: [column[:, None]], np.zeros(1))
+    without = calibration.log_posterior
     paid = 0.5 * np.log(1.0 + column @ column / NOISE_K**2) + 0.5 * 0.5**2
     assert found == pytest.approx(without - paid, abs=2.0)
 
@@ -121,6 +122,4 @@ def test_what_was_reached_counts_where_arithmetic_fails(broken: str, monkeypatch
         raise ArithmeticError("the readings do not tell the unknowns apart")
 
     monkeypatch.setattr(likeliest, broken, fails)
-    assert greatest_log_posterior(calibration.problem, calibration.optimum) == pytest.approx(
-        at_least_squares(calibration), abs=1e-9
-    )
+    assert calibration.log_posterior == pytest.approx(at_least_squares(calibration), abs=1e-9)
