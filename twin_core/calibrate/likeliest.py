@@ -86,8 +86,8 @@ def greatest_log_posterior(
         return _Point(unknowns, fit, amounts, added, left_K, noise, noise.log_likelihood - against)
 
     def climbed(here: _Point) -> _Point:
-        step = _step(problem, optimum, here, mean, std, spread)
-        for share in SHORTER:
+        step, promised = _step(problem, optimum, here, mean, std, spread)
+        for share in SHORTER if promised > SETTLED_NATS else ():
             unknowns = here.unknowns + share * step[: problem.n_unknowns]
             fit = problem.solve(unknowns, near=here.fit)
             if not np.isfinite(fit.cost):
@@ -109,8 +109,11 @@ def greatest_log_posterior(
 
 def _step(
     problem: Problem, optimum: Optimum, here: _Point, mean: FloatArray, std: FloatArray, spread: float
-) -> FloatArray:
-    """Return the step of Gauss and Newton over unknowns and amounts, each residual whitened as its own noise."""
+) -> tuple[FloatArray, float]:
+    """Return the step of Gauss and Newton over unknowns and amounts, each residual whitened as its own noise, and its gain.
+
+    The gain is that of the linearised model under noise that stays as it is, in nats.
+    """
     n, where = problem.n_unknowns, of_sensor(here.columns)
     hessian = block_diag(np.diag(1.0 / std**2), np.eye(here.amounts.size) / spread**2)
     gradient = np.concatenate([(here.unknowns - mean) / std**2, here.amounts / spread**2])
@@ -122,7 +125,8 @@ def _step(
         gradient[own] -= white[:, :-1].T @ white[:, -1]
     if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
         raise ArithmeticError("the sensitivities are not finite")
-    return -solved(hessian, gradient)
+    step = -solved(hessian, gradient)
+    return step, -0.5 * float(gradient @ step)
 
 
 def averaged(whitener: Whitener, columns: Sequence[FloatArray], spread: float) -> float:

@@ -12,6 +12,7 @@ from twin_core.discover.judge import Finding, Judged, Search
 from twin_core.discover.restart import restart
 from twin_core.discover.trial import Trial, resettled, try_effects, try_on_trajectories
 from twin_core.effects import REGISTRY
+from twin_core.effects.base import ParameterSpec
 
 
 @cache
@@ -70,6 +71,27 @@ def test_an_effect_with_one_setting_is_not_fitted_again(monkeypatch: pytest.Monk
     monkeypatch.setattr("twin_core.discover.restart.try_on_trajectories", None)
     restart(state)
     assert state.trial is trial and state.failures == []
+
+
+def test_a_form_of_more_parameters_is_none_of_the_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its parameters would have to be paid for, which completion and the search do."""
+    case, _ = heated()
+    state = found(2.0 * case.parameters["Q_W"])
+    kind = type(state.trial.effects[0])
+
+    class Richer(kind):  # type: ignore[misc, valid-type]
+        def parameter_specs(self) -> tuple[ParameterSpec, ...]:
+            return (*super().parameter_specs(), ParameterSpec("more", "1"))
+
+    starts = kind.starts
+    monkeypatch.setattr(
+        kind,
+        "starts",
+        classmethod(lambda cls, where, survey: (Richer(e.where, e.values, e.settings) for e in starts(where, survey))),
+    )
+    before = state.trial
+    restart(state)
+    assert state.trial is before and state.failures == []
 
 
 def test_nothing_found_is_nothing_to_restart() -> None:
