@@ -18,7 +18,7 @@ from twin_core.effects.base import Effect
 N_STARTS, LEAST_GAIN_SHARE = 4, 0.5
 """Settings from which an effect is fitted again, the best by linear screening, and their least gain as a share of the best
 one's: a limit of time. Of thirteen findings two were caught, 27 and 212 nats below what the second and the first of these led to;
-no setting of a smaller share led anywhere else."""
+none of the settings of a smaller share led to likelier trajectories."""
 
 
 def restart(state: Search) -> None:
