@@ -89,6 +89,7 @@ bench-ablation: $(BENCH)
 	$(BIN)/python -m benchmarks.ablation --cases ablation-cases
 	$(BIN)/python -m benchmarks.lone_changes
 	$(BIN)/python -m benchmarks.gradients
+	$(BIN)/python -m benchmarks.likeliest
 
 bench-decoys: $(BENCH)
 	$(BIN)/python -m benchmarks.decoys

@@ -80,6 +80,18 @@ def test_fit_recovers_the_noise(irregular):
     assert found.sigma_white == pytest.approx(0.1, rel=0.1)
 
 
+@pytest.mark.parametrize("white", [False, True])
+def test_a_climb_from_noise_nearby_ends_where_one_from_everywhere_does(white: bool) -> None:
+    """White noise is no place to climb from: all starts are tried then."""
+    rng, time_s = np.random.default_rng(11), 60.0 * np.arange(600)
+    covariance = 0.3**2 * np.exp(-np.abs(time_s[:, None] - time_s) / 900.0) + 0.05**2 * np.eye(600)
+    residual = rng.multivariate_normal(np.zeros(600), covariance)
+    near = ResidualNoise(0.0 if white else 0.2, 600.0, 0.07, 0.0)
+    found, best = (fit(time_s, residual, white_floor=0.01, near=start) for start in (near, None))
+    assert found.log_likelihood == pytest.approx(best.log_likelihood, abs=1e-3)
+    assert found.length_s == pytest.approx(best.length_s, rel=0.01)
+
+
 def test_white_noise_stays_white():
     residual = np.random.default_rng(4).normal(size=2000)
     found = fit(np.arange(2000.0), residual, white_floor=1e-3)
