@@ -19,8 +19,12 @@ from twin_core.calibrate.undeclared.model import (
     linearise,
     log_likelihood,
     parameter_columns,
+    smoothed_states,
 )
 from twin_core.calibrate.undeclared.size import SizeSearch
+from twin_core.discover.shortlist import survey_of
+from twin_core.discover.trial import extended
+from twin_core.effects.capacity_temperature import CapacityTemperature
 from twin_core.latent_force.held import grid_of
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
@@ -269,3 +273,37 @@ def test_a_first_start_that_fails_at_the_deadline_is_a_numerical_failure(monkeyp
         fit_with_undeclared_heat(problem, deadline=0.0)
     with pytest.raises(np.linalg.LinAlgError):
         fit_with_undeclared_heat(problem)
+
+
+def hidden_wall(seed: int, n_times: int = 600) -> Problem:
+    """Return a heated node before a wall that nobody reads, which has heat that nobody declared."""
+    rng = np.random.default_rng(seed)
+    capacity, time_s = np.array([3.0e3, 3.0e4]), 120.0 * np.arange(n_times)
+    power = np.repeat(rng.choice([0.0, 60.0, 120.0], n_times // 15 + 1), 15)[:n_times]
+    hidden = 80.0 * np.repeat(rng.choice([0.0, 1.0], n_times // 60 + 1), 60)[:n_times]
+    rates = -(laplacian(2, [(0, 1)], [4.0]) + np.diag([0.0, 1.5])) / capacity[:, None]
+    drive = np.stack([power, hidden + 1.5 * 270.0], axis=1) / capacity
+    states = linear_states(rates, drive, np.array([285.0, 280.0]), time_s)
+    power_channel = {"Q": {"kind": "power", "unit": "W"}}
+    loads = [{"channel": "Q", "node": "n0"}]
+    data = conductive_spec(2, [(0, 1)], channels=power_channel, loads=loads, boundaries={"room": {"value_K": 270.0}})
+    del data["channels"][data["nodes"][1].pop("sensor")]
+    data["conductors"].append({"between": ["n1", "room"], "conductance_W_per_K": {"guess": 2.0}})
+    read = states[:, 0] + rng.normal(0.0, 0.1, n_times)
+    return build_problem(build_network(load_spec(data)), [record_of(time_s, Q=power, T0=read)], np.array([0.1]), 1e9)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_fit_from_one_nearby_ends_about_its_own_temperatures(seed: int) -> None:
+    """A law of a node that nobody reads must not be driven by what another fit has drawn from the readings about it."""
+    problem = hidden_wall(seed)
+    near = fit_with_undeclared_heat(problem)
+    (start,) = CapacityTemperature.starts({"node": "n1"}, survey_of(near))
+    rich = extended(problem, [start])
+    free = np.append(near.free, rich.network.parameters.free[-1:])
+    assert rich.network.parameters.free_names[:-1] == problem.network.parameters.free_names
+    fit = fit_with_undeclared_heat(rich, free, near=near, n_passes=6)
+    (nominal,) = fit.nominals
+    states_K, heat_W, _ = smoothed_states(rich, fit.values, fit.undeclared, nominal)
+    again = linearise(rich, fit.values, nominal.segment, states_K, heat_W[:-1], grid=nominal.grid)
+    assert log_likelihood(rich, fit.undeclared, [again]) == pytest.approx(fit.log_likelihood, abs=0.2)

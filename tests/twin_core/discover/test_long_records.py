@@ -13,12 +13,12 @@ from twin_core.discover.trial import Trial
 
 def test_a_long_record_is_searched_on_some_samples_and_calibrated_on_all(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(long_records, "LONGEST", 50)
-    case = network_case("leak_to_boundary", 1, n_orbits=5, dt_s=180.0)
+    case = network_case("missing_conductor", 1, n_orbits=5, dt_s=180.0)
     report = close_loop(case.spec, [case.record]).report
     kept = int((case.record.time_s <= case.record.time_s[0] + 0.7 * np.ptp(case.record.time_s) + 1e-9).sum())
     assert report["search"]["every"] == kept // 50 >= 2
     assert any("calibrated on all of them" in notice for notice in report["notices"])
-    assert [finding["effect"] for finding in report["findings"]] == ["leak_to_boundary"]
+    assert [finding["effect"] for finding in report["findings"]] == ["missing_conductor"]
     assert report["after"]["rmse_K"] < 0.6 * report["before"]["rmse_K"]
 
 

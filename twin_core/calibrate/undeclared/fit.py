@@ -46,6 +46,9 @@ MOST_REFUSED = 2
 LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
 
+MOST_LINEARISED = 3
+"""So many times a fit is taken up again about its own smoothed temperatures, where its likelihood is another one there."""
+
 FIRST_LOG_STEP = 0.7
 """First step of the correlation length, in ln."""
 
@@ -154,7 +157,7 @@ def fit_with_undeclared_heat(
         nominals, undeclared = _carried_over(problem, values, near)
         same = problem.n_nodes == near.problem.n_nodes
         sizes = SizeSearch(FIRST_LOG_STEP, near.size_curvature if same else None)
-        return _settle(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, deadline)
+        return _about_itself(HeatFit(problem, free, undeclared, nominals, -np.inf), sizes, n_passes, deadline)
     first = tuple(
         linearise(problem, values, s, _first_guess(problem, s), np.zeros((s.forcing.n_steps, problem.n_nodes)))
         for s in problem.segments
@@ -178,7 +181,7 @@ def fit_with_undeclared_heat(
     if not started:
         raise ArithmeticError("the first start failed, and there was no time for another")
     fit, sizes = max(started, key=lambda item: item[0].log_posterior)
-    return _settle(fit, sizes, n_passes, deadline)
+    return _about_itself(fit, sizes, n_passes, deadline)
 
 
 def loss_at_start(problem: Problem, free: FloatArray, near: HeatFit) -> float:
@@ -186,6 +189,22 @@ def loss_at_start(problem: Problem, free: FloatArray, near: HeatFit) -> float:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a start too far is as unlikely as can be
         nominals, undeclared = _carried_over(problem, problem.network.parameters.to_values(free), near)
         return near.log_likelihood - log_likelihood(problem, undeclared, nominals)
+
+
+def _about_itself(fit: HeatFit, sizes: SizeSearch, n_passes: int, deadline: float) -> HeatFit:
+    """Take passes until the likelihood no longer grows, and go on until it is that of a model about its own temperatures.
+
+    A law of the temperature of a node that nobody reads, linearised about what another fit made of that node, is driven by
+    what that fit has drawn from the readings: it seems to foretell them.
+    """
+    for _ in range(MOST_LINEARISED):
+        fit = _settle(fit, sizes, n_passes, deadline)
+        nominals = _smoothing_pass(fit.problem, fit.values, fit.undeclared, fit.nominals)
+        told, value = fit.log_likelihood, log_likelihood(fit.problem, fit.undeclared, nominals)
+        fit = replace(fit, nominals=nominals, log_likelihood=value)
+        if abs(value - told) < SETTLED_NATS or is_late(deadline):
+            break
+    return fit
 
 
 def _settle(

@@ -142,13 +142,17 @@ def linearise(
     """
     network, forcing = problem.network, segment.forcing
     steps = one_step(network, values, forcing, states_K[:-1], extra_W, near_K=near_K)
-    reference = affine_march(steps.transition, _drift_K(steps, states_K[:-1], extra_W), segment.start_prior_K)
     sample_of = np.full(forcing.n_steps + 1, -1, dtype=np.int64)
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
-    offset_K = reading_offsets_K(network, values, segment.record.clock_s)
-    read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
     grid = grid or grid_of(forcing.step_s, sample_of, segment.valid)
     means = grid.means_of(steps)
+    # Beside the states everything follows the mean A and B, as it does where the readings are whitened: with those of every
+    # step a reference far from the readings would move with what the states, which were drawn from them, make of A.
+    transition, response = means[0][grid.kind], means[1][grid.kind]
+    pushed = steps.ends_K - states_K[1:] - np.einsum("kij,kj->ki", response, extra_W)
+    reference = states_K + affine_march(transition, pushed, segment.start_prior_K - states_K[0])
+    offset_K = reading_offsets_K(network, values, segment.record.clock_s)
+    read = reference[forcing.sample_step][:, network.sensor_node] + offset_K
     return Nominal(segment, states_K[:-1], extra_W, steps.stages_K, means, read, offset_K, sample_of, grid)
 
 
