@@ -12,7 +12,7 @@ from tests.analytic import laplacian, linear_states
 from tests.helpers import at_named, central_difference, conductive_spec, record_of
 from twin_core.calibrate.optimise import minimise
 from twin_core.calibrate.problem import Problem, build_problem
-from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat, gauss_newton_step
+from twin_core.calibrate.undeclared.fit import fit_with_undeclared_heat, gauss_newton, steps_to_try
 from twin_core.calibrate.undeclared.model import (
     Nominal,
     UndeclaredHeat,
@@ -25,6 +25,7 @@ from twin_core.calibrate.undeclared.size import SizeSearch
 from twin_core.discover.shortlist import survey_of
 from twin_core.discover.trial import extended
 from twin_core.effects.capacity_temperature import CapacityTemperature
+from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.latent_force.held import grid_of
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
@@ -140,11 +141,25 @@ def test_the_hessian_is_that_of_generalised_least_squares() -> None:
     columns = parameter_columns(problem, parameters.values, nominal).reshape(seen.size, -1)[seen]
     inverse = np.linalg.inv(covariance[np.ix_(seen, seen)])
     expected = columns.T @ inverse @ columns + np.diag(1.0 / parameters.prior_std**2)
-    step, hessian = gauss_newton_step(problem, parameters.free, LATENT, [nominal])
+    hessian, gradient = gauss_newton(problem, parameters.free, LATENT, [nominal])
     np.testing.assert_allclose(hessian, expected, rtol=1e-7)
     residual = (problem.segments[0].measured_K - nominal.reference_K).ravel()[seen]
-    # The normal equations are damped by 1e-6 of their diagonal.
-    np.testing.assert_allclose(step, np.linalg.solve(expected, columns.T @ inverse @ residual), rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(gradient, -columns.T @ inverse @ residual, rtol=1e-6, atol=1e-9)
+
+
+def test_where_a_whole_step_goes_too_far_a_load_moves_to_its_likeliest_size_beside_all_else() -> None:
+    problem = small_problem()
+    loaded = extended(problem, [ConstantHeatLoad({"node": "n1"}, {"Q_W": 0.0})])
+    nominal, values = about_own_rollout(loaded), loaded.network.parameters.values
+    seen = loaded.segments[0].valid.ravel()
+    _, covariance = dense_joint(problem)
+    response = parameter_columns(loaded, values, nominal).reshape(seen.size, -1)[seen][:, -1]
+    weighed = np.linalg.solve(covariance[np.ix_(seen, seen)], response)
+    residual = (loaded.segments[0].measured_K - nominal.reference_K).ravel()[seen]
+    free = loaded.network.parameters.free
+    whole, rest, *_ = steps_to_try(loaded, free, *gauss_newton(loaded, free, LATENT, [nominal]))
+    assert np.abs(whole[:-1]).min() > 0.0
+    np.testing.assert_allclose(rest, [0.0, 0.0, 0.0, weighed @ residual / (weighed @ response)], rtol=1e-5)
 
 
 def three_nodes(seed: int, missing_W: float) -> tuple[Problem, dict[str, float]]:

@@ -4,7 +4,7 @@ The parameters follow by generalised least squares on the innovations of a filte
 They stay where the physics is, however much heat the declaration lacks.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -37,8 +37,8 @@ LARGEST_STEP = 1.5
 START_SHARES = (1.0, 0.03)
 """Sizes of the undeclared heat that a fit starts from, as shares of a typical one."""
 
-STEP_SHARES = (1.0, 0.3, 0.1)
-"""Shares of a step of the parameters that are tried in turn."""
+SHORTER_STEPS = (0.3, 0.1)
+"""Shares of a step of the parameters that are tried in turn where the whole one is no better."""
 
 MOST_REFUSED = 2
 """So many passes in which no step of the parameters helped, and only the undeclared heat is sized on."""
@@ -80,14 +80,14 @@ def _relinearised(problem: Problem, values: FloatArray, nominals: Sequence[Nomin
     return tuple(linearise(problem, values, n.segment, states_of(n), n.extra_W, n.stages_K, n.grid) for n in nominals)
 
 
-def gauss_newton_step(
+def gauss_newton(
     problem: Problem,
     free: FloatArray,
     undeclared: UndeclaredHeat,
     nominals: Sequence[Nominal],
     most_std: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the Gauss-Newton step of the free parameters, (n_free,), and the Hessian, (n_free, n_free).
+    """Return Hessian, (n_free, n_free), and gradient, (n_free,), of what speaks against free parameters, as of Gauss and Newton.
 
     ``most_std`` shortens the priors of logarithmic parameters for the early passes, in which the undeclared heat is still so
     large that it could take over what conductances do.
@@ -103,7 +103,30 @@ def gauss_newton_step(
         flat = whitened.reshape(-1, columns.shape[2])
         hessian += flat[:, :-1].T @ flat[:, :-1]
         gradient -= flat[:, :-1].T @ flat[:, -1]
-    return bounded_step(_solved, hessian, gradient, *problem.step_bounds(free, LARGEST_STEP)), hessian
+    return hessian, gradient
+
+
+def steps_to_try(problem: Problem, free: FloatArray, hessian: FloatArray, gradient: FloatArray) -> Iterator[FloatArray]:
+    """Yield steps of the free parameters, to be tried in turn, (n_free,) each.
+
+    The whole Gauss-Newton step reckons with the covariance as it is, which moves with capacities and conductances. Where it goes
+    too far, that of all other parameters is worth what it promises: the readings are linear in most of them.
+    """
+    lowest, highest = problem.step_bounds(free, LARGEST_STEP)
+    step = bounded_step(_solved, hessian, gradient, lowest, highest)
+    if _promised(step, hessian) < LEAST_GAIN_NATS:
+        return
+    yield step
+    lowest[problem.logarithmic] = highest[problem.logarithmic] = 0.0
+    rest = bounded_step(_solved, hessian, gradient, lowest, highest)
+    if _promised(rest, hessian) > LEAST_GAIN_NATS:
+        yield rest
+    yield from (share * step for share in SHORTER_STEPS)
+
+
+def _promised(step: FloatArray, hessian: FloatArray) -> float:
+    """Return by how many nats a step makes the readings likelier, if the Hessian is right."""
+    return 0.5 * float(step @ hessian @ step)
 
 
 def _solved(hessian: FloatArray, gradient: FloatArray) -> FloatArray:
@@ -263,7 +286,7 @@ def with_capacities(
 
 
 def _improve(fit: HeatFit, most_std: float) -> tuple[FloatArray, UndeclaredHeat, tuple[Nominal, ...]]:
-    """Take one Gauss-Newton step, shortened until the likelihood (with priors) does not fall."""
+    """Take the first of some steps that makes the readings likelier, with the priors; none where none does."""
     problem, free, undeclared, nominals = fit.problem, fit.free, fit.undeclared, fit.nominals
     parameters, std = problem.network.parameters, tightened_prior_std(problem, most_std)
 
@@ -272,11 +295,9 @@ def _improve(fit: HeatFit, most_std: float) -> tuple[FloatArray, UndeclaredHeat,
 
     before = fit.log_likelihood + log_prior(free)
     with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
-        step, hessian = gauss_newton_step(problem, free, undeclared, nominals, most_std)
-        if 0.5 * float(step @ hessian @ step) < LEAST_GAIN_NATS:
-            return free, undeclared, nominals
-    for share in STEP_SHARES:
-        trial = free + share * step
+        steps = list(steps_to_try(problem, free, *gauss_newton(problem, free, undeclared, nominals, most_std)))
+    for step in steps:
+        trial = free + step
         values = parameters.to_values(trial)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
             size, about = (
