@@ -38,7 +38,7 @@ START_SHARES = (1.0, 0.03)
 """Sizes of the undeclared heat that a fit starts from, as shares of a typical one."""
 
 SHORTER_STEPS = (0.3, 0.1)
-"""Shares of a step of the parameters that are tried in turn where the whole one is no better."""
+"""Shares of a step of the parameters that are tried in turn where the whole one is no better, a limit of time."""
 
 MOST_REFUSED = 2
 """So many passes in which no step of the parameters helped, and only the undeclared heat is sized on."""
@@ -47,7 +47,8 @@ LEAST_GAIN_NATS = 0.02
 """A step of the parameters that promises less is not taken."""
 
 MOST_LINEARISED = 3
-"""So many times a fit is taken up again about its own smoothed temperatures, where its likelihood is another one there."""
+"""Times that a fit is linearised about its own smoothed temperatures, a limit of time. Of 73 fits of two networks none took more;
+of 140 of two measured sets 7 settled in up to 8, and 14 not even then: they run away and end as unlikely."""
 
 FIRST_LOG_STEP = 0.7
 """First step of the correlation length, in ln."""
@@ -87,7 +88,7 @@ def gauss_newton(
     nominals: Sequence[Nominal],
     most_std: float = np.inf,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Hessian, (n_free, n_free), and gradient, (n_free,), of what speaks against free parameters, as of Gauss and Newton.
+    """Return the Gauss-Newton Hessian, (n_free, n_free), and the gradient, (n_free,), of the negative log posterior.
 
     ``most_std`` shortens the priors of logarithmic parameters for the early passes, in which the undeclared heat is still so
     large that it could take over what conductances do.
@@ -109,8 +110,8 @@ def gauss_newton(
 def steps_to_try(problem: Problem, free: FloatArray, hessian: FloatArray, gradient: FloatArray) -> Iterator[FloatArray]:
     """Yield steps of the free parameters, to be tried in turn, (n_free,) each.
 
-    The whole Gauss-Newton step reckons with the covariance as it is, which moves with capacities and conductances. Where it goes
-    too far, that of all other parameters is worth what it promises: the readings are linear in most of them.
+    The Gauss-Newton step holds the covariance of the readings, which depends on capacities and conductances. Where it goes too
+    far, the step of all other parameters is tried: the readings are linear in most of them, and the covariance does not change.
     """
     lowest, highest = problem.step_bounds(free, LARGEST_STEP)
     step = bounded_step(_solved, hessian, gradient, lowest, highest)
@@ -215,10 +216,10 @@ def loss_at_start(problem: Problem, free: FloatArray, near: HeatFit) -> float:
 
 
 def _about_itself(fit: HeatFit, sizes: SizeSearch, n_passes: int, deadline: float) -> HeatFit:
-    """Take passes until the likelihood no longer grows, and go on until it is that of a model about its own temperatures.
+    """Take passes until the likelihood no longer grows, and again until it is linearised about its own smoothed temperatures.
 
-    A law of the temperature of a node that nobody reads, linearised about what another fit made of that node, is driven by
-    what that fit has drawn from the readings: it seems to foretell them.
+    The temperatures of another fit hold what that fit inferred from the readings: a law of a node that nobody reads, linearised
+    about them, would seem to predict what it was told.
     """
     for _ in range(MOST_LINEARISED):
         fit = _settle(fit, sizes, n_passes, deadline)
@@ -294,19 +295,15 @@ def _improve(fit: HeatFit, most_std: float) -> tuple[FloatArray, UndeclaredHeat,
         return -0.5 * float((((at - parameters.free) / std) ** 2).sum())
 
     before = fit.log_likelihood + log_prior(free)
-    with np.errstate(over="ignore", invalid="ignore"):  # a response that runs away gives no step: refused below
-        steps = list(steps_to_try(problem, free, *gauss_newton(problem, free, undeclared, nominals, most_std)))
-    for step in steps:
-        trial = free + step
-        values = parameters.to_values(trial)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a step too far is refused just below
-            size, about = (
-                with_capacities(problem, undeclared, fit.values, values),
-                _relinearised(problem, values, nominals),
-            )
-            better = log_likelihood(problem, size, about) + log_prior(trial) > before
-        if better:
-            return trial, size, about
+    # A response that runs away gives no step, and a step too far is refused just below.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        for step in steps_to_try(problem, free, *gauss_newton(problem, free, undeclared, nominals, most_std)):
+            trial = free + step
+            values = parameters.to_values(trial)
+            size = with_capacities(problem, undeclared, fit.values, values)
+            about = _relinearised(problem, values, nominals)
+            if log_likelihood(problem, size, about) + log_prior(trial) > before:
+                return trial, size, about
     return free, undeclared, nominals
 
 

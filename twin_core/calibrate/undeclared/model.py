@@ -146,8 +146,8 @@ def linearise(
     sample_of[forcing.sample_step] = np.arange(forcing.sample_step.size)
     grid = grid or grid_of(forcing.step_s, sample_of, segment.valid)
     means = grid.means_of(steps)
-    # Beside the states everything follows the mean A and B, as it does where the readings are whitened: with those of every
-    # step a reference far from the readings would move with what the states, which were drawn from them, make of A.
+    # Deviations from the states follow the mean A and B here as in the covariance of the readings. A of every step depends on
+    # states that were inferred from the readings: a reference far from them would seem to predict them.
     transition, response = means[0][grid.kind], means[1][grid.kind]
     pushed = steps.ends_K - states_K[1:] - np.einsum("kij,kj->ki", response, extra_W)
     reference = states_K + affine_march(transition, pushed, segment.start_prior_K - states_K[0])
