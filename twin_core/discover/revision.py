@@ -16,6 +16,7 @@ from twin_core.discover.judge import (
     NO_MORE,
     OUTDONE,
     SMALL_REMAINDER,
+    UNDECIDED,
     Finding,
     Judged,
     Search,
@@ -120,31 +121,32 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
 
 def _in_place_of(
     state: Search, finding: Finding, option: Judged, needed: float, margin: float, foresight: float
-) -> bool:
-    """Take an option instead of a finding, if it is likelier by a margin and passes; return whether it did.
+) -> Judged | None:
+    """Take an option instead of a finding, if it is likelier by a margin and passes.
 
-    Supported by the odds asked for the option must be in any case. Its error on what it was not fitted to must be below
-    ``foresight`` times that of the finding.
+    Return what it is in its place, with the reason if it does not pass; None where it is no rival. Supported by the odds asked
+    for the option must be in any case. Its error on what it was not fitted to must be below ``foresight`` times that of the
+    finding.
     """
     places = finding.judged.places
     kept = attempted_without(state, places)
     if kept is None:
-        return False
+        return None
     without, lost = kept
     trial = try_effects(option.trial, (*without.effects, *option.effects), n_passes=12)
     instead = Judged(trial.effects[len(without.effects) :], weigh(without, trial, max(state.n_named, 1)), trial)
     if instead.evidence.log_bayes_factor <= max(needed, lost + margin):
-        return False
+        return None
     examined, _ = examine(without, instead, needed)
     if examined.reason:
-        return False
+        return examined
     if foresight < np.inf and not foresight_of(examined) < foresight * validate(without, state.trial).foresight:
-        return False
+        return None
     state.rejected = [j for j in state.rejected if j.effects != option.effects]
     state.rejected.append(replace(finding.judged, reason=OUTDONE))
     state.findings = [Finding(examined) if f is finding else f for f in state.findings]
     state.trial = trial
-    return True
+    return examined
 
 
 def prune(state: Search, needed: float) -> None:
@@ -220,8 +222,12 @@ def _is_better(name: Finding, heat: Finding) -> bool:
 
 
 def tell_alternatives(state: Search, needed: float) -> None:
-    """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more."""
-    for i, finding in enumerate(state.findings):
+    """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more.
+
+    A name is withdrawn where another one in its place is likelier by the odds asked for and is no law that foretells: likelihood
+    and foresight contradict each other then, and nobody can tell.
+    """
+    for finding in list(state.findings):
         kept = attempted_without(state, finding.judged.places)
         if kept is None:
             continue
@@ -229,37 +235,50 @@ def tell_alternatives(state: Search, needed: float) -> None:
             partial(add_coarse_alternatives, state, kept[0], finding, needed),
             f"alternatives to {finding.judged.labels}",
         )
-        if compared is not None:
-            state.findings[i] = compared
-            _lead_with_the_best(state, i, needed)
-            told = {e.place for option in state.findings[i].alternatives for e in option.effects}
-            state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in told)]
+        if compared is None:
+            continue
+        position = next(i for i, f in enumerate(state.findings) if f is finding)
+        state.findings[position] = compared
+        contradicting = _lead_with_the_best(state, position, needed)
+        told = state.findings[position]
+        places = {e.place for option in told.alternatives for e in option.effects}
+        state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in places)]
+        if any(j.evidence.log_bayes_factor > kept[1] + needed for j in contradicting):
+            state.rejected += [replace(j, reason=UNDECIDED) for j in (told.judged, *told.alternatives)]
+            _drop(state, told.judged.places, *kept)
 
 
-def _lead_with_the_best(state: Search, position: int, needed: float) -> None:
+def _lead_with_the_best(state: Search, position: int, needed: float) -> list[Judged]:
     """Exchange a finding for the best of its alternatives that passes, if it is simpler, likelier, or predicts better.
 
     A simpler one leads that the readings hardly tell from it, and of those as simple the likeliest. The first look ranks by
     linear responses, and what it left out may turn out to explain more: likelier by the odds asked for, or leaving less and
-    predicting better what it was not fitted to. The finding is an alternative then.
+    predicting better what it was not fitted to. The finding is an alternative then. Where it stays, those are returned that were
+    as likely in its place as was asked and do not foretell.
     """
     finding = state.findings[position]
     own = finding.judged
     ranked = sorted(finding.alternatives, key=worth)
     simple = [j for j in ranked if is_close(j, own) and (complexity(j), worth(j)) < (complexity(own), worth(own))]
-    better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in simple]
-    better += [(j, needed, np.inf) for j in ranked if worth(j) < worth(own) - needed]
+    likelier = [j for j in ranked if worth(j) < worth(own) - needed and all(j is not s for s in simple)]
+    better = [(j, -policy.ALTERNATIVE_NATS, np.inf) for j in simple] + [(j, needed, np.inf) for j in likelier]
     no_freer = [j for j in ranked if complexity(j)[0] <= complexity(own)[0]]
     asked = ((j, state.attempt(j.trial.unexplained, j.labels)) for j in no_freer)
     less = [(value, j) for j, value in asked if value is not None and value < state.trial.unexplained()]
     better += [(j, -np.inf, policy.FORESIGHT) for _, j in sorted(less, key=lambda option: option[0])[:N_EXCHANGED]]
+    unforeseen = []
     for best, margin, foresight in better:
         replaced = partial(_in_place_of, state, finding, best, needed, margin, foresight)
-        if state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}"):
+        instead = state.attempt(replaced, f"{best.labels} in place of {finding.judged.labels}")
+        if instead is None:
+            continue
+        if not instead.reason:
             others = [option for option in finding.alternatives if option is not best]
             alternatives = tuple(sorted((finding.judged, *others), key=worth))
             state.findings[position] = replace(state.findings[position], alternatives=alternatives)
-            return
+            return []
+        unforeseen += [instead] if instead.reason == NO_FORESIGHT else []
+    return unforeseen
 
 
 def attempted_without(state: Search, places: Collection[object]) -> Without | None:

@@ -29,6 +29,7 @@ from twin_core.discover.judge import (
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
+    UNDECIDED,
     Finding,
     Judged,
     Search,
@@ -424,9 +425,9 @@ def kind_at(kind: str, node: str, nats: float, reason: str = "") -> Judged:
         (60.0 + NEEDED + JUST, 60.0 + NEEDED + JUST, "", "boundary_mix"),
         (60.0 + NEEDED, 99.0, "", "constant_heat_load"),
         (90.0, 60.0 + NEEDED, "", "constant_heat_load"),
-        (90.0, 99.0, NO_FORESIGHT, "constant_heat_load"),
+        (90.0, 99.0, NO_LAW, "constant_heat_load"),
     ],
-    ids=["likelier", "hardly likelier", "refitted hardly likelier", "predicts no better"],
+    ids=["likelier", "hardly likelier", "refitted hardly likelier", "no law"],
 )
 def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
     monkeypatch: pytest.MonkeyPatch, nats: float, alone: float, reason: str, leads: str
@@ -448,6 +449,34 @@ def test_the_likeliest_of_the_names_that_cannot_be_told_apart_leads(
     names = [a.effects[0].name for a in finding.alternatives]
     assert names == (["constant_heat_load"] * 2 if leads == "boundary_mix" else ["boundary_mix", "constant_heat_load"])
     assert state.rejected == []
+
+
+@pytest.mark.parametrize(
+    ("alone", "reason", "told"),
+    [
+        (60.0 + NEEDED + JUST, NO_FORESIGHT, []),
+        (60.0 + NEEDED, NO_FORESIGHT, ["constant_heat_load"]),
+        (60.0 + NEEDED + JUST, SIZE_NOT_DETERMINED, ["constant_heat_load"]),
+    ],
+    ids=["contradicted", "hardly likelier", "no size"],
+)
+def test_a_name_is_withdrawn_where_a_far_likelier_one_predicts_no_better(
+    monkeypatch: pytest.MonkeyPatch, alone: float, reason: str, told: list[str]
+) -> None:
+    """Neither is named: what is likelier and what foretells are different effects."""
+    found, option = judged("a", 60.0), judged("b", 90.0)
+    without = stub()
+    compared = Finding(found, (option,))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: compared)
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (without, 60.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(alone, 0.0))
+    monkeypatch.setattr(revision, "examine", lambda simple, judged, needed: (replace(judged, reason=reason), False))
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    assert [e.name for f in state.findings for e in f.effects] == told
+    assert [j.reason for j in state.rejected] == ([] if told else [UNDECIDED] * 2)
+    assert (state.trial is without) == (not told)
 
 
 @pytest.mark.parametrize(
