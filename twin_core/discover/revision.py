@@ -75,6 +75,30 @@ def withdraw(state: Search, needed: float) -> None:
             _examine_again(state, rest, needed)
 
 
+def foretell_together(state: Search) -> None:
+    """Drop findings until all of them together predict what they were not fitted to better than the declared model does.
+
+    Each was examined beside those before it, and with the parameters of then. The one goes without which the rest predicts best.
+    """
+    while len(state.findings) > 1:
+        whole = state.attempt(partial(validate, state.base, state.trial), "what all findings foretell together")
+        if whole is None or whole.foresight < 1.0:
+            return
+        rests = _without_each(state, [finding.judged.places for finding in state.findings])
+        foretold: dict[frozenset[object], float] = {}
+        for places, kept in rests.items():
+            rest = kept and state.attempt(partial(validate, state.base, kept[0]), f"what is foretold without {places}")
+            foretold |= {places: rest.foresight} if rest else {}
+        if not foretold:
+            return
+        worst = min(foretold, key=lambda places: foretold[places])
+        dropped = next(finding for finding in state.findings if finding.judged.places == worst)
+        state.rejected.append(replace(dropped.judged, reason=NO_FORESIGHT))
+        kept = rests[worst]
+        assert kept is not None
+        _drop(state, worst, *kept)
+
+
 def _times(
     state: Search, without: Trial, asked: float, places: frozenset[object], named: Collection[frozenset[object]]
 ) -> float:

@@ -30,7 +30,7 @@ from twin_core.discover.judge import (
     worth,
 )
 from twin_core.discover.restart import restart
-from twin_core.discover.revision import prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import foretell_together, prune, reconsider, tell_alternatives, withdraw
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import (
@@ -125,6 +125,7 @@ def search(
         exchange(state, needed)
         if _places(state) == known:
             break  # what was found does not hold: the next step would find it again
+    foretell_together(state)
     withdraw(state, needed)
     if not state.findings:
         progress(0.85, "looking beside temperature gradients within the nodes")

@@ -43,6 +43,7 @@ from twin_core.discover.policy import (
     THRESHOLDS,
 )
 from twin_core.discover.revision import (
+    foretell_together,
     prune,
     reconsider,
     tell_alternatives,
@@ -123,6 +124,37 @@ def test_what_a_name_foretells_by_itself_counts_beside_others_too(
     state.findings = [Finding(judged("n0", 50.0)), Finding(judged("n1", 40.0))]
     withdraw(state, NEEDED)
     assert [f.effects[0].where["node"] for f in state.findings] == kept
+
+
+@pytest.mark.parametrize(
+    ("of_all", "of_rests", "kept"),
+    [
+        (1.0 - JUST, {"n0 n1": 0.2, "n0 n2": 0.2, "n1 n2": 0.2}, ["n0", "n1", "n2"]),
+        (1.0, {"n0 n1": 0.9, "n0 n2": 0.8, "n1 n2": 0.85}, ["n0", "n2"]),
+        (np.nan, {"n0 n1": 0.9, "n0 n2": 0.95, "n1 n2": 0.85}, ["n1", "n2"]),
+        (1.5, {"n0 n1": 1.1, "n0 n2": 1.2, "n1 n2": 1.3, "n0": 0.9, "n1": 0.8}, ["n1"]),
+        (1.5, {"n0 n1": 1.1, "n0 n2": 1.2, "n1 n2": 1.3, "n0": 1.9, "n1": 1.8}, ["n1"]),
+    ],
+    ids=["better", "no better", "no number", "two of three", "one has passed by itself"],
+)
+def test_findings_together_must_foretell_more_than_the_declared_model(
+    monkeypatch: pytest.MonkeyPatch, of_all: float, of_rests: dict[str, float], kept: list[str]
+) -> None:
+    """In a house a lag and a hidden mass passed, then a step of the Sun's gain, and all together predicted 2.2 times worse."""
+    foresight = {"": 1.0, "n0 n1 n2": of_all, **of_rests}
+
+    def refitted(effects: Sequence[Effect]) -> Trial:
+        return stub(*effects, foresight=foresight[" ".join(sorted(e.where["node"] for e in effects))])
+
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    names = ["n0", "n1", "n2"]
+    state = Search(refitted([load(name) for name in names]), refitted(()))
+    state.findings = [Finding(judged(name, 50.0)) for name in names]
+    foretell_together(state)
+    assert [f.effects[0].where["node"] for f in state.findings] == kept
+    assert sorted(e.where["node"] for e in state.trial.effects) == kept
+    assert [j.reason for j in state.rejected] == [NO_FORESIGHT] * (len(names) - len(kept))
 
 
 @pytest.mark.parametrize(
