@@ -32,7 +32,8 @@ def notes(result: Result) -> str:
     if result.at_deadline:
         told.append(f"the deadline of {result.deadline_s:.0f} s ended the search")
     if result.failures:
-        told.append(f"{len(result.failures)} candidates failed")
+        n = len(result.failures)
+        told.append(f"{n} candidate{'s' * (n > 1)} failed")
     told += [f"{samples} {reason} masked" for reason, samples in (result.masked or {}).items()]
     if result.peak_MB > MANY_MB:
         told.append(f"{result.peak_MB / 1000.0:.1f} GB")

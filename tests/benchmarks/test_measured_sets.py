@@ -50,7 +50,7 @@ def test_one_table_with_every_kind_of_row() -> None:
         "| three blocks: 2 h, then 22 h | effect_added | boundary_mix (room) | 0.441 | 0.245 | linear fit 0.20 | 12"
         " | 3 frozen masked |"
     )
-    assert "**worse after**; the deadline of 60 s ended the search; 1 candidates failed" in rows[1]
+    assert "**worse after**; the deadline of 60 s ended the search; 1 candidate failed" in rows[1]
     assert "| crashed |" in rows[2] and rows[2].count("|") == rows[0].count("|")
     assert in_one_line(CRASHED).startswith("Chandra")
 
