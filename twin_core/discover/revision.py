@@ -76,27 +76,37 @@ def withdraw(state: Search, needed: float) -> None:
 
 
 def foretell_together(state: Search) -> None:
-    """Drop findings until all of them together predict what they were not fitted to better than the declared model does.
+    """Drop findings until all that are left predict what they were not fitted to better than the declared model does.
 
     Each was examined beside those before it, and with the parameters of then. The one goes without which the rest predicts best.
+    A single finding was compared with the declared model when it was made, and is asked again only where others have gone.
     """
-    while len(state.findings) > 1:
-        whole = state.attempt(partial(validate, state.base, state.trial), "what all findings foretell together")
-        if whole is None or whole.foresight < 1.0:
+    n_found = len(state.findings)
+    while len(state.findings) > 1 or 0 < len(state.findings) < n_found:
+        together = _foretold(state, state.trial, "what all findings foretell together")
+        if together is None or together < 1.0:
             return
         rests = _without_each(state, [finding.judged.places for finding in state.findings])
-        foretold: dict[frozenset[object], float] = {}
-        for places, kept in rests.items():
-            rest = kept and state.attempt(partial(validate, state.base, kept[0]), f"what is foretold without {places}")
-            foretold |= {places: rest.foresight} if rest else {}
+        foretold: list[tuple[float, Finding, Without]] = []
+        for finding in state.findings:
+            kept = rests[finding.judged.places]
+            rest = kept and _foretold(state, kept[0], f"what is foretold without {finding.judged.labels}")
+            foretold += [(rest, finding, kept)] if kept and rest is not None else []
         if not foretold:
             return
-        worst = min(foretold, key=lambda places: foretold[places])
-        dropped = next(finding for finding in state.findings if finding.judged.places == worst)
-        state.rejected.append(replace(dropped.judged, reason=NO_FORESIGHT))
-        kept = rests[worst]
-        assert kept is not None
-        _drop(state, worst, *kept)
+        _, gone, kept = min(foretold, key=lambda item: item[0])
+        state.rejected.append(replace(gone.judged, reason=NO_FORESIGHT))
+        _drop(state, gone.judged.places, *kept)
+
+
+def _foretold(state: Search, trial: Trial, what: str) -> float | None:
+    """Return the error of a trial on what it was not fitted to, over that of the declared model; None where it is not known."""
+    if not trial.effects:
+        return 1.0
+    validation = state.attempt(partial(validate, state.base, trial), what)
+    if validation is None:
+        return None
+    return validation.foresight if np.isfinite(validation.foresight) else np.inf
 
 
 def _times(
