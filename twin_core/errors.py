@@ -35,5 +35,9 @@ class NoSolutionError(ModelError):
     """The declared model has no solution from any start: the command line shows it in one line and exits with 1."""
 
 
+class PrecisionError(ModelError, ArithmeticError):
+    """Numbers that double precision cannot hold together. In a search it ends one fit, as any failure of arithmetic does."""
+
+
 class Cancelled(TwinError):
     """A long job was asked to stop."""

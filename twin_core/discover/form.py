@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from twin_core.calibrate.containment import attempted
 from twin_core.discover.evidence import weigh
 from twin_core.discover.shortlist import UNDECLARED_SHARES, schwarz_gain, screened
 from twin_core.discover.trial import Trial, explained, try_effects
@@ -88,14 +89,14 @@ def against_free_forms(
     return both(partial(_repeatable, trial, left, n_tried), partial(_removed_more, simple, trial, rivals, most))
 
 
-def _repeatable(trial: Trial, options: Sequence[Trial], n_tried: int) -> Repeatable:
+def _repeatable(trial: Trial, options: Sequence[Trial | None], n_tried: int) -> Repeatable:
     """Return what the likeliest of some trials with a free form on top removes."""
     for top in _likeliest(trial, options):
         return Repeatable(weigh(trial, top, n_tried).log_bayes_factor, explained(trial, top))
     return Repeatable()
 
 
-def _removed_more(simple: Trial, trial: Trial, rivals: Sequence[Trial], most: float) -> float | None:
+def _removed_more(simple: Trial, trial: Trial, rivals: Sequence[Trial | None], most: float) -> float | None:
     """Return what the likeliest rival of a trial removes more than it, if it is far likelier."""
     likelier = [r for r in _likeliest(simple, rivals) if weigh(r, trial, 1).log_bayes_factor < -most]
     return max((trial.unexplained() - rival.unexplained() for rival in likelier), default=None)
@@ -120,14 +121,19 @@ def more_is_left_elsewhere(
     return away > needed and away > (here or repeatable_heat(trial, own, needed)).log_bayes_factor
 
 
-def _refitted(options: Sequence[tuple[Trial, Effect]]) -> list[Trial]:
-    """Return trials with an effect on top of each, side by side."""
-    return side_by_side([partial(try_effects, trial, (*trial.effects, e), n_passes=6) for trial, e in options])
+def _refitted(options: Sequence[tuple[Trial, Effect]]) -> list[Trial | None]:
+    """Return trials with an effect on top of each, side by side; None for one whose arithmetic fails."""
+
+    def refitted(trial: Trial, effect: Effect) -> Trial | None:
+        return attempted(partial(try_effects, trial, (*trial.effects, effect), n_passes=6), effect.label, [])
+
+    return side_by_side([partial(refitted, *option) for option in options])
 
 
-def _likeliest(simple: Trial, options: Sequence[Trial]) -> Sequence[Trial]:
+def _likeliest(simple: Trial, options: Sequence[Trial | None]) -> Sequence[Trial]:
     """Return the likeliest option beside wandering heat, alone: weighing one in full takes open-loop trajectories."""
-    return sorted(options, key=lambda trial: -weigh(simple, trial, 1, quick=True).log_bayes_factor)[:1]
+    fitted = [option for option in options if option is not None]
+    return sorted(fitted, key=lambda trial: -weigh(simple, trial, 1, quick=True).log_bayes_factor)[:1]
 
 
 def acts_at(trial: Trial, effects: Sequence[Effect]) -> set[str]:

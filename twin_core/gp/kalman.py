@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.errors import ModelError
+from twin_core.errors import ModelError, PrecisionError
 from twin_core.gp.linalg import alike, congruence, symmetrise
 from twin_core.gp.state_space import LinearModel, ModelArrays
 
@@ -67,7 +67,7 @@ def failure(model: LinearModel, sample: int) -> ModelError:
     """Return the error of a sample whose variance is not positive."""
     if (model.noise_variance == 0.0).any():
         return ModelError(f"sample {sample}: a sensor without noise measures what is known exactly; give it some noise")
-    return ModelError(
+    return PrecisionError(
         f"sample {sample}: variances differ by more than double precision holds; give the first state a prior that is "
         "less vague, or the sensors more noise"
     )

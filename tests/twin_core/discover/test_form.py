@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin_core.calibrate.second_order import fit_network
+from twin_core.discover import form
 from twin_core.discover.evidence import Evidence, weigh
 from twin_core.discover.form import Repeatable, acts_at, against_free_forms, more_is_left_elsewhere, repeatable_heat
 from twin_core.discover.judge import Finding, Judged, Search, most_left, threshold
@@ -17,6 +18,7 @@ from twin_core.effects.constant_heat_load import ConstantHeatLoad
 from twin_core.effects.leak_to_boundary import LeakToBoundary
 from twin_core.effects.proportional_heater import ProportionalHeater
 from twin_core.effects.radiation_to_sink import RadiationToSink
+from twin_core.errors import PrecisionError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 
@@ -157,6 +159,19 @@ def test_what_repeats_elsewhere_is_no_remainder_of_a_name(
     assert more_is_left_elsewhere(trial, trial.effects, NEEDED) is elsewhere
     here = repeatable_heat(trial, acts_at(trial, trial.effects), NEEDED)
     assert more_is_left_elsewhere(trial, trial.effects, NEEDED, here) is elsewhere
+
+
+def test_a_free_form_that_cannot_be_fitted_is_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose variances ran away took a sensor's offset of 13 K with it, 1,300 nats likelier than anything else."""
+    base, trial = named(resonance)
+    assert repeatable_heat(trial, {"a"}, NEEDED).log_bayes_factor > NEEDED
+
+    def fails(*_: object, **__: object) -> Trial:
+        raise PrecisionError("sample 651: variances differ by more than double precision holds")
+
+    monkeypatch.setattr(form, "try_effects", fails)
+    assert repeatable_heat(trial, {"a"}, NEEDED) == Repeatable()
+    assert against_free_forms(base, trial, {"a"}, trial.effects, NEEDED, NEEDED) == (Repeatable(), None)
 
 
 def test_a_single_node_has_no_elsewhere() -> None:
