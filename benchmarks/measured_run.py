@@ -108,8 +108,8 @@ class Result:
 
     @property
     def is_worse(self) -> bool:
-        """Whether the corrected model predicts the hold-out worse than the declared one."""
-        return self.after_K > WORSE * self.before_K
+        """Whether the corrected model predicts the hold-out worse than the declared one, or not at all."""
+        return self.verdict != "" and not self.after_K <= WORSE * self.before_K
 
     def holds_for(self, deadline_s: float) -> bool:
         """Whether a run with this deadline would have come to the same: a search that ended in time needs no more."""
@@ -309,6 +309,12 @@ def supervised(name: str, work: Callable[[], Result], code: str, deadline_s: flo
         return Result(name, code, deadline_s, error=words, hung=hung, seconds=seconds)
 
 
+def compile_all() -> None:
+    """Compile the loops of the product in a process of its own, where they are not compiled yet."""
+    with contextlib.suppress(TimeoutError, RuntimeError):
+        alone(_compile, COMPILING_S)
+
+
 def measure_all(
     splits: Sequence[Split], data: Path, *, deadline_s: float, cache: Path | None, fresh: bool, n_processes: int
 ) -> Iterator[Result]:
@@ -333,8 +339,7 @@ def measure_all(
     yield from (known[split.name] for split in splits if split.name in known)
     todo = [split for split in splits if split.name not in known]
     if todo:
-        with contextlib.suppress(TimeoutError, RuntimeError):
-            alone(_compile, COMPILING_S)
+        compile_all()
     with ThreadPoolExecutor(n_processes) as pool:
         running = [
             pool.submit(supervised, s.name, partial(_measure_named, s.name, data, code, deadline_s), code, deadline_s)

@@ -11,6 +11,7 @@ from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.compiled import deadline_after
 from twin_core.calibrate.containment import TimeIsUpError, attempted, limited
 from twin_core.calibrate.discrepancy import stated
+from twin_core.calibrate.identifiability import resting
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import fit_network
@@ -126,12 +127,17 @@ def close_loop(
         declared, lost = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         base, every = searched(whole)
-        found = search(
-            base,
-            false_alarm_rate=false_alarm_rate,
-            deadline=deadline,
-            first={effect.place for effect in first},
-            progress=lambda f, m: progress(0.35 + 0.5 * f, m),
+        # Beside a sensor that is stuck whatever is found would be wrong: a steady reading amid moving ones needs some effect.
+        found = (
+            Search(base, base)
+            if resting(spec.sensors, train)
+            else search(
+                base,
+                false_alarm_rate=false_alarm_rate,
+                deadline=deadline,
+                first={effect.place for effect in first},
+                progress=lambda f, m: progress(0.35 + 0.5 * f, m),
+            )
         )
         found.every = every
         doubts = look_for_mistakes(found, deadline=latest)

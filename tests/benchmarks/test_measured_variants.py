@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.measured_run import Result
 from benchmarks.measured_splits import Prepared, Split, example
-from benchmarks.measured_variants import CHANGES, Brought, table, variant
+from benchmarks.measured_variants import CHANGES, GUESS_DECADES, Brought, holes, table, variant, wrong_guesses
 from twin_core.network.spec_io import dump_spec
 from twin_core.telemetry import Record
 
@@ -36,13 +36,32 @@ def test_a_variant_is_drawn_by_its_seed_and_is_a_declaration(name: str, tmp_path
         name, "set", lambda folder: Prepared(example(name), [a_record(name)], holdout=0.3), lambda folder: "none"
     )
     for seed in range(20):
-        told, given = variant(seed, [split], tmp_path)
-        again, _ = variant(seed, [split], tmp_path)
-        assert told == again
-        assert told.startswith("set: record, ")
+        told, given = variant(seed, split, tmp_path)
+        words, again = variant(seed, split, tmp_path)
+        assert told == words and told.startswith("set: record, ")
+        assert given.spec == again.spec and given.holdout == again.holdout
+        (record,), (same,) = given.records, again.records
+        np.testing.assert_array_equal(record.time_s, same.time_s)
+        for channel, column in record.values.items():
+            np.testing.assert_array_equal(column, same.values[channel])
         assert given.holdout is not None and 0.2 <= given.holdout <= 0.6
         assert given.spec.sensors
-        assert 60 <= given.records[0].time_s.size <= 1000
+        assert 60 <= record.time_s.size <= 1000
+
+
+def test_one_reading_in_twenty_is_lost_and_guesses_stay_within_their_decades() -> None:
+    own = Brought(dump_spec(example("three-block")), a_record("three-block"))
+    holes(np.random.default_rng(0), own)
+    lost = np.mean([np.isnan(own.record.values[sensor]).mean() for sensor in example("three-block").sensors])
+    assert lost == pytest.approx(0.05, abs=0.02)
+    wrong_guesses(np.random.default_rng(0), own)
+    before = dump_spec(example("three-block"))
+    ratios = [
+        node["capacity_J_per_K"]["guess"] / given["capacity_J_per_K"]["guess"]
+        for node, given in zip(own.spec["nodes"], before["nodes"], strict=True)
+    ]
+    assert all(10.0**-GUESS_DECADES <= ratio <= 10.0**GUESS_DECADES for ratio in ratios)
+    assert len(set(ratios)) == len(ratios)
 
 
 def test_a_table_counts_what_came_of_it() -> None:

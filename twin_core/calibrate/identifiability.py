@@ -290,7 +290,7 @@ def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
     said = []
     for name in resting([*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)], records):
         meaning = (
-            "what rests tells nothing of capacities; if the sensor is stuck, take it out: what is found around it is wrong"
+            "what rests tells nothing of capacities, and no effect is looked for beside it; if the sensor is stuck, take it out"
             if name in spec.sensors
             else "the record cannot tell its heat from any other steady heat where it acts"
         )

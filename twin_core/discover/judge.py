@@ -32,6 +32,9 @@ Without = tuple[Trial, float]
 
 NOT_SUPPORTED = "the evidence does not reach the odds asked for"
 NO_FORESIGHT = "it does not predict what it was not fitted to better than the model without it"
+NO_FORESIGHT_TOGETHER = (
+    "with the other findings it does not predict what it was not fitted to better than the declared model"
+)
 SIZE_NOT_DETERMINED = "the record does not determine its size: other parameters of the model make up for it"
 LESS_LIKELY = "the readings are less likely along its trajectories than along those of the model without it"
 NO_MODEL = "the corrected model could not be computed"

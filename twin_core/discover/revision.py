@@ -13,6 +13,7 @@ from twin_core.discover.coarseness import least_explained, times_asked, times_li
 from twin_core.discover.evidence import validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
+    NO_FORESIGHT_TOGETHER,
     NO_MORE,
     OUTDONE,
     SMALL_REMAINDER,
@@ -76,10 +77,11 @@ def withdraw(state: Search, needed: float) -> None:
 
 
 def foretell_together(state: Search) -> None:
-    """Drop findings until all that are left predict what they were not fitted to better than the declared model does.
+    """Drop findings until those left predict, together, what they were not fitted to better than the declared model does.
 
-    Each was examined beside those before it, and with the parameters of then. The one goes without which the rest predicts best.
-    A single finding was compared with the declared model when it was made, and is asked again only where others have gone.
+    Each finding was examined beside the earlier ones only, with the parameters fitted at that time. The finding is dropped whose
+    removal leaves the rest predicting best. A single finding was compared with the declared model when it was made; it is asked
+    again only after others have been dropped.
     """
     n_found = len(state.findings)
     while len(state.findings) > 1 or 0 < len(state.findings) < n_found:
@@ -95,7 +97,7 @@ def foretell_together(state: Search) -> None:
         if not foretold:
             return
         _, gone, kept = min(foretold, key=lambda item: item[0])
-        state.rejected.append(replace(gone.judged, reason=NO_FORESIGHT))
+        state.rejected.append(replace(gone.judged, validation=None, reason=NO_FORESIGHT_TOGETHER))
         _drop(state, gone.judged.places, *kept)
 
 
@@ -156,11 +158,11 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
 def _in_place_of(
     state: Search, finding: Finding, option: Judged, needed: float, margin: float, foresight: float
 ) -> Judged | None:
-    """Take an option instead of a finding, if it is likelier by a margin and passes.
+    """Put an option in the place of a finding if it is likelier by a margin and passes the examination.
 
-    Return what it is in its place, with the reason if it does not pass; None where it is no rival. Supported by the odds asked
-    for the option must be in any case. Its error on what it was not fitted to must be below ``foresight`` times that of the
-    finding.
+    The option must be supported by the odds asked for in any case, and its error on what it was not fitted to must be below
+    ``foresight`` times that of the finding. Returns the option as refitted there, with the reason if it does not pass; None
+    where it is not likely enough to be examined, or predicts too little to replace the finding.
     """
     places = finding.judged.places
     kept = attempted_without(state, places)
@@ -258,8 +260,8 @@ def _is_better(name: Finding, heat: Finding) -> bool:
 def tell_alternatives(state: Search, needed: float) -> None:
     """Tell beside each finding the names that a coarse network cannot tell from it; they count as refused no more.
 
-    A name is withdrawn where another one in its place is likelier by the odds asked for and is no law that foretells: likelihood
-    and foresight contradict each other then, and nobody can tell.
+    A name is withdrawn where another one in its place is likelier by the odds asked for but predicts too little to be named:
+    likelihood and prediction then contradict each other, and neither name can be told.
     """
     for finding in list(state.findings):
         kept = attempted_without(state, finding.judged.places)
@@ -273,12 +275,16 @@ def tell_alternatives(state: Search, needed: float) -> None:
             continue
         position = next(i for i, f in enumerate(state.findings) if f is finding)
         state.findings[position] = compared
-        contradicting = _lead_with_the_best(state, position, needed)
+        unforeseen = _lead_with_the_best(state, position, needed)
         told = state.findings[position]
+        least = kept[1] if told.judged is finding.judged else told.judged.evidence.log_bayes_factor
+        contradicting = {j.places for j in unforeseen if j.evidence.log_bayes_factor > least + needed}
         places = {e.place for option in told.alternatives for e in option.effects}
         state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in places)]
-        if any(j.evidence.log_bayes_factor > kept[1] + needed for j in contradicting):
-            state.rejected += [replace(j, reason=UNDECIDED) for j in (told.judged, *told.alternatives)]
+        if contradicting:
+            undecided = {told.judged.places, *contradicting}
+            options = (told.judged, *told.alternatives)
+            state.rejected += [replace(j, reason=UNDECIDED if j.places in undecided else OUTDONE) for j in options]
             _drop(state, told.judged.places, *kept)
 
 
@@ -287,8 +293,8 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> list[Jud
 
     A simpler one leads that the readings hardly tell from it, and of those as simple the likeliest. The first look ranks by
     linear responses, and what it left out may turn out to explain more: likelier by the odds asked for, or leaving less and
-    predicting better what it was not fitted to. The finding is an alternative then. Where it stays, those are returned that were
-    as likely in its place as was asked and do not foretell.
+    predicting better what it was not fitted to. The finding is an alternative then. Returns the options that were likely enough
+    in its place and were refused because they do not predict better than the model without them.
     """
     finding = state.findings[position]
     own = finding.judged
@@ -310,7 +316,7 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> list[Jud
             others = [option for option in finding.alternatives if option is not best]
             alternatives = tuple(sorted((finding.judged, *others), key=worth))
             state.findings[position] = replace(state.findings[position], alternatives=alternatives)
-            return []
+            break
         unforeseen += [instead] if instead.reason == NO_FORESIGHT else []
     return unforeseen
 
@@ -318,7 +324,7 @@ def _lead_with_the_best(state: Search, position: int, needed: float) -> list[Jud
 def attempted_without(state: Search, places: Collection[object]) -> Without | None:
     """Return the trial without the effects at places, and their log Bayes factor; None where it cannot be computed.
 
-    It is asked for again and again, of the same trial: once is enough.
+    The answer is kept with the trial, of which it is asked several times.
     """
     gone = frozenset(places)
     return _without_each(state, [gone])[gone]
@@ -347,7 +353,7 @@ def _forms(effects: Sequence[Effect]) -> frozenset[object]:
 
 
 def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[frozenset[object], Without | None]:
-    """Return the same for several sets of places, side by side."""
+    """Return what :func:`attempted_without` does for each of several sets of places, computed side by side."""
     if state.without is None or state.without[0] is not state.trial:
         state.without = state.trial, {}
     known = state.without[1]
@@ -357,7 +363,8 @@ def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[fr
         return without, weigh(without, state.trial, 1).log_bayes_factor
 
     new = [gone for gone in dict.fromkeys(sets) if gone not in known]
-    works = [(partial(weighed, gone), "the model without " + " and ".join(map(str, gone))) for gone in new]
+    labels = {gone: [effect.label for effect in state.trial.effects if effect.place in gone] for gone in new}
+    works = [(partial(weighed, gone), "the model without " + " and ".join(labels[gone])) for gone in new]
     known |= zip(new, state.attempt_each(works), strict=True)
     return {gone: known[gone] for gone in sets}
 

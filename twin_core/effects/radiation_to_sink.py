@@ -15,7 +15,7 @@ class RadiationToSink(Effect):
     keys = ("node", "sink")
     equation = "q = sigma R (T_s^4 - T^4)"
     reference = "Gilmore, Spacecraft Thermal Control Handbook, 2nd ed., ch. 2"
-    sentence = "a radiator from {node} to {sink} was missing"
+    sentence = "radiation from {node} to {sink} was missing"
     driven_by = "radiation"
 
     def parameter_specs(self) -> tuple[ParameterSpec, ...]:

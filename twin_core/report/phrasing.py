@@ -41,6 +41,13 @@ def headline(report: Mapping[str, Any]) -> str:
         more = len(findings) - 1
         others = f"; {more} more effect{'s were' if more > 1 else ' was'} found" if more else ""
         return f"{sentence(findings[0], capital=True)}{others}."
+    if resting and verdict == "unexplained":
+        names = (
+            f"Sensors {', '.join(resting)} never change" if len(resting) > 1 else f"Sensor {resting[0]} never changes"
+        )
+        return (
+            f"{names}: stuck or at rest. No missing effect is looked for; take out of the specification what is stuck."
+        )
     if (report.get("search") or {}).get("complete") is False:
         if verdict == "unexplained":
             return "Something is missing from the model; the deadline ended the search before an effect explained it."

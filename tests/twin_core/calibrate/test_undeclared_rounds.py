@@ -38,6 +38,7 @@ def a_problem() -> Problem:
         ([100.0, 101.0, 90.0], [98.0, 99.0, 300.0], 1, 3),  # likely about its own alone: the fit swings
         ([100.0, 110.0], [98.0, -np.inf], 0, 2),  # ran away: the round before it stays
         ([100.0, 110.0], [98.0, np.nan], 0, 2),
+        ([100.0, 90.0], [98.0, 90.0], 0, 2),  # settled, but where it is less likely than before
     ],
 )
 def test_the_fit_is_kept_that_is_likeliest_about_both(

@@ -24,6 +24,7 @@ from twin_core.discover.coarseness import stands
 from twin_core.discover.evidence import Evidence, Validation
 from twin_core.discover.judge import (
     NO_FORESIGHT,
+    NO_FORESIGHT_TOGETHER,
     NO_LAW,
     NO_MORE,
     OUTDONE,
@@ -132,10 +133,11 @@ def test_what_a_name_foretells_by_itself_counts_beside_others_too(
         (1.0 - JUST, {"n0 n1": 0.2, "n0 n2": 0.2, "n1 n2": 0.2}, ["n0", "n1", "n2"]),
         (1.0, {"n0 n1": 0.9, "n0 n2": 0.8, "n1 n2": 0.85}, ["n0", "n2"]),
         (np.nan, {"n0 n1": 0.9, "n0 n2": 0.95, "n1 n2": 0.85}, ["n1", "n2"]),
+        (1.0, {"n0 n1": np.nan, "n0 n2": 0.8, "n1 n2": np.nan}, ["n0", "n2"]),
         (1.5, {"n0 n1": 1.1, "n0 n2": 1.2, "n1 n2": 1.3, "n0": 0.9, "n1": 0.8}, ["n1"]),
         (1.5, {"n0 n1": 1.1, "n0 n2": 1.2, "n1 n2": 1.3, "n0": 1.9, "n1": 1.0}, []),
     ],
-    ids=["better", "no better", "no number", "two of three", "all"],
+    ids=["better", "no better", "no number", "no number without one", "two of three", "all"],
 )
 def test_findings_together_must_foretell_more_than_the_declared_model(
     monkeypatch: pytest.MonkeyPatch, of_all: float, of_rests: dict[str, float], kept: list[str]
@@ -154,7 +156,7 @@ def test_findings_together_must_foretell_more_than_the_declared_model(
     foretell_together(state)
     assert [f.effects[0].where["node"] for f in state.findings] == kept
     assert sorted(e.where["node"] for e in state.trial.effects) == kept
-    assert [j.reason for j in state.rejected] == [NO_FORESIGHT] * (len(names) - len(kept))
+    assert [j.reason for j in state.rejected] == [NO_FORESIGHT_TOGETHER] * (len(names) - len(kept))
 
 
 def test_a_single_finding_is_not_asked_again_what_it_foretells() -> None:

@@ -88,6 +88,8 @@ def test_the_headline_leads_with_sensors_that_never_change() -> None:
     assert phrasing.headline(report).startswith("No sensor ever changes (T_a)")
     report["before"] = {"per_sensor": {"T_a": {}, "T_b": {}}}
     assert "suffices" in phrasing.headline(report)
+    told = phrasing.headline(report | {"verdict": "unexplained"})
+    assert told.startswith("Sensor T_a never changes: stuck or at rest.")
 
 
 def test_headline_of_each_verdict() -> None:

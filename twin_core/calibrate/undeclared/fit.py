@@ -219,17 +219,18 @@ def _about_itself(fit: HeatFit, sizes: SizeSearch, n_passes: int, deadline: floa
     """Take passes until the likelihood no longer grows, and again until it is linearised about its own smoothed temperatures.
 
     The temperatures of another fit hold what that fit inferred from the readings: a law of a node that nobody reads, linearised
-    about them, would seem to predict what it was told. Where that does not settle, the fit is kept that is likeliest about both
-    the temperatures that it was fitted to and its own.
+    about them, would seem to predict what it was told. Of the rounds the fit is kept whose smaller log posterior, about the
+    temperatures that it was fitted to and about its own, is the greatest: one that swings is likely about one of them alone.
     """
     rounds: list[tuple[float, HeatFit]] = []
     for _ in range(MOST_LINEARISED):
         fit = _settle(fit, sizes, n_passes, deadline)
         nominals = _smoothing_pass(fit.problem, fit.values, fit.undeclared, fit.nominals)
         told, value = fit.log_likelihood, log_likelihood(fit.problem, fit.undeclared, nominals)
+        value = value if np.isfinite(value) else -np.inf
         fit = replace(fit, nominals=nominals, log_likelihood=value)
-        rounds.append((min(told, value) + fit.log_prior if np.isfinite(value) else -np.inf, fit))
-        if not np.isfinite(value) or abs(value - told) < SETTLED_NATS or is_late(deadline):
+        rounds.append((min(told, value) + fit.log_prior, fit))
+        if value == -np.inf or abs(value - told) < SETTLED_NATS or is_late(deadline):
             break
     return max(rounds, key=lambda item: item[0])[1]
 
