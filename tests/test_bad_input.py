@@ -230,6 +230,7 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
     (HEAD + '2026-01-01T00:00:00Z,"20,293,5\n', "row 2: "),
     (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples"),
     (HEAD + "2026-01-01T00:00:00Z,20,,5\n2026-01-01T00:01:00Z,20,,5\n", "channel 'T_b' has no samples"),
+    (HEAD + "2026-01-01T00:00:00Z,20,0,5\n2026-01-01T00:01:00Z,20,0,5\n", "all its samples are masked (sentinel)"),
     (HEAD + "2026-01-01T00:00:00Z,20,293,\n2026-01-01T00:01:00Z,20,293,\n", "channel 'Q_a' has no samples"),
 ]
 

@@ -11,6 +11,7 @@ from twin_core._typing import Json, Progress, no_progress
 from twin_core.calibrate.compiled import deadline_after
 from twin_core.calibrate.containment import TimeIsUpError, attempted, limited
 from twin_core.calibrate.discrepancy import stated
+from twin_core.calibrate.explained import advised
 from twin_core.calibrate.identifiability import resting
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
@@ -24,7 +25,7 @@ from twin_core.discover.screen import survey_of
 from twin_core.discover.search import search
 from twin_core.discover.trial import Trial
 from twin_core.effects.base import Effect
-from twin_core.errors import ModelError, TelemetryError
+from twin_core.errors import ModelError, NoSolutionError, TelemetryError
 from twin_core.holdout import HeldOut, Prediction, predict, split_burn_in, split_fraction
 from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
@@ -122,7 +123,10 @@ def close_loop(
         holdout_records = all_screened(spec, holdout_records or ())
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
         check_moments(train, moments)
-        fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
+        try:
+            fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
+        except NoSolutionError as error:
+            raise NoSolutionError(advised(str(error), spec, train, deadline)) from error
         before = to_model(calibration, ())
         declared, lost = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))

@@ -117,8 +117,11 @@ def _check_sampled(spec: TwinSpec, records: Sequence[Record]) -> None:
     for channel in spec.used_channels:
         if not any(np.isfinite(record.values[channel]).any() for record in records):
             names = ", ".join(record.name for record in records)
+            masked = sorted({f.reason for record in records for f in record.flaws or () if f.channel == channel})
+            what = f"no readings, for all its samples are masked ({', '.join(masked)})" if masked else "no samples"
+            mend = "correct" if masked else "add"
             raise TelemetryError(
-                f"{names}: channel '{channel}' has no samples; add them or remove it from the specification"
+                f"{names}: channel '{channel}' has {what}; {mend} them or remove it from the specification"
             )
 
 

@@ -16,6 +16,7 @@ from twin_core.calibrate.starting import table_levels
 from twin_core.calibrate.summary import stated_guesses, to_model
 from twin_core.calibrate.suspicions import close_words, declared_of, is_odd, suspicions
 from twin_core.errors import NoSolutionError
+from twin_core.network.doubts import doubts
 from twin_core.network.model import build_network
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
@@ -42,7 +43,7 @@ def calibrate_and_explain(
     try:
         calibration = fit_trajectories(spec, records, loss=loss, deadline=deadline, progress=progress)
     except NoSolutionError as error:
-        raise NoSolutionError(_advised(str(error), spec, records, deadline)) from error
+        raise NoSolutionError(advised(str(error), spec, records, deadline)) from error
     return explained(to_model(calibration, ()), calibration, deadline=deadline)
 
 
@@ -64,11 +65,11 @@ def explained(model: CalibratedModel, calibration: Calibration, *, deadline: flo
     return replace(model, summary={**model.summary, "words": words, "suspicions": [s.to_json() for s in looked.found]})
 
 
-def _advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: float) -> str:
-    """Return the error with the mistakes that would have a solution."""
+def advised(error: str, spec: TwinSpec, records: Sequence[Record], deadline: float = NO_DEADLINE) -> str:
+    """Return the error with what is most likely wrong with the channels, and the mistakes with which there is a solution."""
     seen = all_screened(spec, records)
     network = build_network(spec, table_knots=table_levels(spec, seen))
     problem = build_problem(network, seen, sensor_noise_K(spec, seen))
     looked = suspicions(declared_of(problem), deadline=deadline)
-    told = [error, *(f"perhaps {s.words}" for s in looked.found), looked.left_out]
+    told = [error, *doubts(spec, seen), *(f"perhaps {s.words}" for s in looked.found), looked.left_out]
     return "; ".join(line for line in told if line)

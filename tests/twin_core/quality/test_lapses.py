@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from tests.helpers import conductive_spec, record_of
+from twin_core import closed_loop
 from twin_core._typing import FloatArray
 from twin_core.calibrate import calibrate
 from twin_core.closed_loop import close_loop
+from twin_core.errors import NoSolutionError
 from twin_core.network.spec import TwinSpec
 from twin_core.network.spec_io import load_spec
 from twin_core.quality.gaps import without_lapses
@@ -148,3 +150,17 @@ def test_a_lapse_in_the_hold_out_is_told_and_not_scored() -> None:
     assert report["before"]["rmse_K"] < 0.03 and report["findings"] == []
     (notice,) = (notice for notice in report["notices"] if "channel 'Q' has no samples" in notice)
     assert "69 row(s) left out" in notice
+
+
+def test_what_is_wrong_with_the_channels_is_told_where_there_is_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A heater in milliwatts left the declared network without a heat balance, and only its loads in general were named."""
+    spec, record = heated()
+    inputs = {channel: 1e3 * record.values[channel] for channel in spec.driving_channels if "Q" in channel}
+    assert inputs
+
+    def fails(*_: object, **__: object) -> None:
+        raise NoSolutionError("calibration failed")
+
+    monkeypatch.setattr(closed_loop, "fit_network", fails)
+    with pytest.raises(NoSolutionError, match=r"calibration failed; channel 'Q.*mW"):
+        close_loop(spec, [Record(record.time_s, {**record.values, **inputs})])
