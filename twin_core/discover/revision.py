@@ -15,6 +15,7 @@ from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_FORESIGHT_TOGETHER,
     NO_MORE,
+    NOT_SUPPORTED,
     OUTDONE,
     SMALL_REMAINDER,
     UNDECIDED,
@@ -134,24 +135,33 @@ def _alone(
 
 
 def _examine_again(state: Search, places: Collection[object], needed: float, *, foresight: float = -np.inf) -> None:
-    """Withdraw the finding at places if by itself it does not pass what any option must; little that it leaves was explained.
+    """Withdraw the finding at places if by itself it is not supported or does not pass what any option must.
 
-    Error on what it was not fitted to, after over before, is enough below ``foresight`` too.
+    Little that it leaves was explained by what has gone. Error on what it was not fitted to, after over before, is enough below
+    ``foresight`` too.
     """
     without = attempted_without(state, places)
     finding = next(f for f in state.findings if f.judged.places == places)
     if without is None:
         return
-    option = replace(finding.judged, trial=state.trial)
-    examined = state.attempt(partial(examine, without[0], option, needed), option.labels)
+    simple, nats = without
+    option = replace(
+        finding.judged, trial=state.trial, evidence=replace(finding.judged.evidence, log_bayes_factor=nats)
+    )
+    if nats <= needed:
+        state.rejected.append(replace(option, reason=NOT_SUPPORTED))
+        _drop(state, places, *without)
+        return
+    examined = state.attempt(partial(examine, simple, option, needed), option.labels)
     if examined is None:
         return
-    predicts = examined[0].reason == NO_FORESIGHT and foresight_of(examined[0]) < foresight
-    if predicts or examined[0].reason in ("", SMALL_REMAINDER):
-        again = replace(finding, judged=replace(finding.judged, validation=examined[0].validation))
+    own, _ = examined
+    predicts = own.reason == NO_FORESIGHT and foresight_of(own) < foresight
+    if predicts or own.reason in ("", SMALL_REMAINDER):
+        again = replace(finding, judged=replace(own, reason=""))
         state.findings = [again if f is finding else f for f in state.findings]
         return
-    state.rejected.append(examined[0])
+    state.rejected.append(own)
     _drop(state, places, *without)
 
 

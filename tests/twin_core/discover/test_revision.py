@@ -27,6 +27,7 @@ from twin_core.discover.judge import (
     NO_FORESIGHT_TOGETHER,
     NO_LAW,
     NO_MORE,
+    NOT_SUPPORTED,
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
@@ -296,6 +297,30 @@ def test_beside_the_others_each_must_be_supported_and_explain_something(
     assert [e.where["node"] for e in state.trial.effects] == kept
 
 
+@pytest.mark.parametrize(("nats", "kept"), [(NEEDED, []), (NEEDED + JUST, ["b"])])
+def test_what_is_left_of_a_set_must_be_supported_by_itself(
+    monkeypatch: pytest.MonkeyPatch, nats: float, kept: list[str]
+) -> None:
+    """Of a healthy spacecraft a radiation was named that was worth 1.7 nats, after the conductor beside it had been dropped."""
+    support = {"a": NEEDED, "b": nats}
+
+    def weighed(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+        (lost,) = {str(e.where["node"]) for e in rich.effects} - {str(e.where["node"]) for e in simple.effects}
+        return Evidence(support[lost], 0.0)
+
+    monkeypatch.setattr(
+        revision, "try_effects", lambda trial, effects, n_passes: stub(*effects, left=9.0 * (2 - len(effects)))
+    )
+    monkeypatch.setattr(revision, "weigh", weighed)
+    monkeypatch.setattr(revision, "examine", lambda simple, option, needed: (option, False))
+    pair = stub(load("a"), load("b"))
+    state = Search(pair, stub(left=18.0), findings=[Finding(Judged(pair.effects, Evidence(99.0, 0.0), pair))])
+    prune(state, NEEDED)
+    assert [e.where["node"] for f in state.findings for e in f.effects] == kept
+    assert [f.judged.evidence.log_bayes_factor for f in state.findings] == [nats] * len(kept)
+    assert [j.reason for j in state.rejected] == ([] if kept else [NOT_SUPPORTED])
+
+
 def test_without_its_thresholds_nothing_is_withdrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """As an ablation sets them."""
     monkeypatch.setattr(policy, "DOMINANCE", THRESHOLDS["DOMINANCE"].off)
@@ -327,7 +352,7 @@ def test_of_effects_found_together_each_must_explain_something(
         return stub(*effects, left=left + sum(value for name, value in parts.items() if name not in names))
 
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: refitted(tuple(effects)))
-    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(0.0, 1.0))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(NEEDED + JUST, 1.0))
     asked: list[tuple[Effect, ...]] = []
 
     def examined(simple: Trial, option: Judged, needed: float) -> tuple[Judged, bool]:
