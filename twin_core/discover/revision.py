@@ -291,7 +291,7 @@ def tell_alternatives(state: Search, needed: float) -> None:
         contradicting = {j.places for j in unforeseen if j.evidence.log_bayes_factor > least + needed}
         places = {e.place for option in told.alternatives for e in option.effects}
         state.rejected = [j for j in state.rejected if not (len(j.effects) == 1 and j.effects[0].place in places)]
-        if contradicting:
+        if contradicting and not all(effect.fallback for effect in told.effects):
             undecided = {told.judged.places, *contradicting}
             options = (told.judged, *told.alternatives)
             state.rejected += [replace(j, reason=UNDECIDED if j.places in undecided else OUTDONE) for j in options]

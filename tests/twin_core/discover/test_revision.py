@@ -545,6 +545,23 @@ def test_a_name_is_withdrawn_where_a_far_likelier_one_predicts_no_better(
     assert (state.trial is without) == (not told)
 
 
+def test_a_heat_without_a_name_is_not_contradicted_by_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It claims no law, and predicts better than nothing."""
+    option, kind = judged("b", 90.0), type(load("a"))
+    heat = type("Free", (kind,), {"fallback": True})({"node": "a"}, {"Q_W": 1.0})
+    found = Judged((heat,), Evidence(60.0, 0.0), stub(heat))
+    compared = Finding(found, (option,))
+    monkeypatch.setattr(revision, "add_coarse_alternatives", lambda state, simple, finding, needed: compared)
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 60.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(90.0, 0.0))
+    refused = lambda simple, judged, needed: (replace(judged, reason=NO_FORESIGHT), False)  # noqa: E731
+    monkeypatch.setattr(revision, "examine", refused)
+    state = Search(found.trial, stub(), findings=[Finding(found)])
+    tell_alternatives(state, NEEDED)
+    assert state.findings == [compared]
+
+
 @pytest.mark.parametrize(
     ("behind", "alone", "reason", "leads"),
     [
