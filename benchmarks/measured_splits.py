@@ -214,3 +214,15 @@ SPLITS = (
         for i, (structure, states) in HOMES.items()
     ),
 )
+
+ONE_OF_EACH = (
+    "halogen lamp: 800 s, then 800 s",
+    "Chandra power supply: flight a, then b",
+    "FUNcube-1: 60 %, then 40 %",
+    "FlexHouse, one node: 60 %, then 40 %",
+    "FlexHouse, room and envelope: 60 %, then 40 %",
+    "Dutch home 1: 70 %, then 30 %",
+    "Dutch home 2: 70 %, then 30 %",
+    "Dutch home 3: 70 %, then 30 %",
+)
+"""A split of every set but the blocks and the lab, of which others may be wanted."""

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_run import THREADS, Result, compile_all, measure, sources, supervised
 from benchmarks.measured_sets import present
-from benchmarks.measured_splits import DATA, SPLITS, Prepared, Split
+from benchmarks.measured_splits import DATA, ONE_OF_EACH, SPLITS, Prepared, Split
 from twin_core.errors import ModelError, NoSolutionError, SpecError, TelemetryError, TwinError
 from twin_core.network.model import build_network
 from twin_core.network.spec import TwinSpec
@@ -32,14 +32,7 @@ SETS = (
     "three blocks: 12 h, then 12 h",
     "three blocks, one film coefficient: 12 h, then 12 h",
     "temperature lab: a sine and a step, then all 11 others",
-    "halogen lamp: 800 s, then 800 s",
-    "Chandra power supply: flight a, then b",
-    "FUNcube-1: 60 %, then 40 %",
-    "FlexHouse, one node: 60 %, then 40 %",
-    "FlexHouse, room and envelope: 60 %, then 40 %",
-    "Dutch home 1: 70 %, then 30 %",
-    "Dutch home 2: 70 %, then 30 %",
-    "Dutch home 3: 70 %, then 30 %",
+    *ONE_OF_EACH,
 )
 TITLE = "Measured telemetry as others would bring it"
 FIRST_SEED, COUNT, DEADLINE_S = 1, 22, 120.0

@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.loop import place, run_all, where_in_words
 from benchmarks.markdown import markdown_table, save_table
 from benchmarks.measured_sets import present
-from benchmarks.measured_splits import DATA, SPLITS, Split
+from benchmarks.measured_splits import DATA, ONE_OF_EACH, SPLITS, Split
 from twin_core.closed_loop import close_loop
 from twin_core.errors import TwinError
 from twin_core.network.model import build_network
@@ -30,14 +30,7 @@ SETS = (
     "three blocks: 12 h, then 12 h",
     "temperature lab: same session",
     "temperature lab: a fast and a very fast sine, then four such",
-    "halogen lamp: 800 s, then 800 s",
-    "Chandra power supply: flight a, then b",
-    "FUNcube-1: 60 %, then 40 %",
-    "FlexHouse, one node: 60 %, then 40 %",
-    "FlexHouse, room and envelope: 60 %, then 40 %",
-    "Dutch home 1: 70 %, then 30 %",
-    "Dutch home 2: 70 %, then 30 %",
-    "Dutch home 3: 70 %, then 30 %",
+    *ONE_OF_EACH,
 )
 MOST_PARTS = 6
 """Parts of a declaration that are taken out at most, spread over all of them."""

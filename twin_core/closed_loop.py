@@ -3,6 +3,7 @@
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -15,7 +16,7 @@ from twin_core.calibrate.explained import advised
 from twin_core.calibrate.identifiability import resting
 from twin_core.calibrate.problem import measured_temperatures
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.undeclared.model import HeatFit
 from twin_core.discover import policy
@@ -123,26 +124,17 @@ def close_loop(
         holdout_records = all_screened(spec, holdout_records or ())
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
         check_moments(train, moments)
-        try:
-            fit, calibration = fit_network(spec, train, deadline=deadline, progress=lambda f, m: progress(0.35 * f, m))
-        except NoSolutionError as error:
-            raise NoSolutionError(advised(str(error), spec, train, deadline)) from error
+        fit, calibration = _calibrated(spec, train, deadline, lambda f, m: progress(0.35 * f, m))
         before = to_model(calibration, ())
         declared, lost = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
         base, every = searched(whole)
+        found = Search(base, base)
         # Beside a sensor that is stuck whatever is found would be wrong: a steady reading amid moving ones needs some effect.
-        found = (
-            Search(base, base)
-            if resting(spec.sensors, train)
-            else search(
-                base,
-                false_alarm_rate=false_alarm_rate,
-                deadline=deadline,
-                first={effect.place for effect in first},
-                progress=lambda f, m: progress(0.35 + 0.5 * f, m),
-            )
-        )
+        if not resting(spec.sensors, train):
+            tried_first = {effect.place for effect in first}
+            told = partial(_part_of, progress)
+            found = search(base, false_alarm_rate=false_alarm_rate, deadline=deadline, first=tried_first, progress=told)
         found.every = every
         doubts = look_for_mistakes(found, deadline=latest)
         if doubts.outdo(found):
@@ -171,6 +163,21 @@ def close_loop(
         report["elapsed_s"] = time.perf_counter() - begun
         progress(1.0, "done")
         return ClosedLoop(report, after, before, plots)
+
+
+def _part_of(progress: Progress, fraction: float, message: str) -> None:
+    """Tell the progress of the search as a part of the whole."""
+    progress(0.35 + 0.5 * fraction, message)
+
+
+def _calibrated(
+    spec: TwinSpec, train: Sequence[Record], deadline: float, progress: Progress
+) -> tuple[HeatFit, Calibration]:
+    """Return the fits of the declared network; where it has no solution the error names what is most likely wrong."""
+    try:
+        return fit_network(spec, train, deadline=deadline, progress=progress)
+    except NoSolutionError as error:
+        raise NoSolutionError(advised(str(error), spec, train, deadline)) from error
 
 
 def _predicted(declared: CalibratedModel, held: Sequence[HeldOut]) -> tuple[list[Prediction], ModelError | None]:
