@@ -23,8 +23,8 @@ FORWARD_SHARE = 0.35
 """End of a single segment that is predicted from its beginning."""
 
 OPENING_SHARE = 0.1
-"""First samples of a segment, which tell its initial state, and those after an event, which tell its size: left out by no check
-of what follows."""
+"""First samples of a segment, which tell its initial state, and those after an event, which tell its size, of the latter no more
+than half of what follows: left out by no check of what follows."""
 
 MOST_FOLDS = 4
 """Groups of segments that are left out in turn."""
@@ -148,7 +148,8 @@ def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]
     if len(segments) == 1:
         (segment,) = segments
         n_rows = segment.measured_K.shape[0]
-        told = int(np.searchsorted(segment.record.clock_s, event_s)) + OPENING_SHARE * n_rows
+        event = int(np.searchsorted(segment.record.clock_s, event_s))
+        told = event + min(OPENING_SHARE * n_rows, (n_rows - event) / 2.0)
         return [[np.arange(n_rows)[:, None] >= int(max((1.0 - FORWARD_SHARE) * n_rows, told))]]
     n_folds = min(len(segments), MOST_FOLDS)
     return [

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.optimize import minimize
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.errors import ModelError
@@ -23,6 +22,15 @@ WHITE_STARTS = (1.0, 0.3)
 """First guesses of the white part, as shares of what first differences show."""
 CLIMBS = 2
 """Best starting points from which the likelihood is climbed."""
+
+SETTLED_NATS, MOST_STEPS = 1e-5, 100
+"""A climb ends where a step promises no more, or after so many: a limit of accuracy and one of time."""
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e6
+"""Shares of the information that are added to its diagonal (Levenberg and Marquardt)."""
+LONGEST_STEP = 1.0
+"""Of the logarithm of a parameter: quadratic models say nothing of what lies further away."""
+LEAST_INFORMATION = 1e-9
+"""Information on a parameter that the readings say nothing of: its step is as large as the bounds let it be, or none."""
 
 
 @dataclass(frozen=True)
@@ -126,15 +134,18 @@ def _whiten(
 
 
 @njit(cache=True)
-def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> tuple[float, FloatArray]:
-    """Return the log-likelihood and its gradient in ln(sigma_ou), ln(length), ln(sigma_white)."""
+def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Return the log-likelihood, its gradient in ln(sigma_ou), ln(length), ln(sigma_white), and Fisher's information on them.
+
+    Of the information (3, 3) the part that follows from the surprises is what they show, not what is expected of them.
+    """
     colour, white = np.exp(2.0 * log_values[0]), np.exp(2.0 * log_values[2])
     inverse_length = np.exp(-log_values[1])
     d_colour = np.array([2.0 * colour, 0.0, 0.0])
     d_white = np.array([0.0, 0.0, 2.0 * white])
     mean, variance = 0.0, colour
-    d_mean, d_variance = np.zeros(3), d_colour.copy()
-    total, gradient = 0.0, np.zeros(3)
+    d_mean, d_variance, d_spread = np.zeros(3), d_colour.copy(), np.zeros(3)
+    total, gradient, information = 0.0, np.zeros(3), np.zeros((3, 3))
     step, decay, d_decay = -1.0, 0.0, np.zeros(3)
     for k in range(residual.size):
         if k > 0:
@@ -157,14 +168,74 @@ def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> 
         weighted = surprise / spread
         total -= 0.5 * (LOG_2PI + np.log(spread) + surprise * weighted)
         for p in range(3):
-            d_spread = d_variance[p] + d_white[p]
-            gradient[p] -= 0.5 * (d_spread / spread - weighted * weighted * d_spread) - weighted * d_mean[p]
-            d_gain = (d_variance[p] - gain * d_spread) / spread
+            d_spread[p] = d_variance[p] + d_white[p]
+            gradient[p] -= 0.5 * (d_spread[p] / spread - weighted * weighted * d_spread[p]) - weighted * d_mean[p]
+            for q in range(p + 1):
+                information[p, q] += (
+                    0.5 * d_spread[p] * d_spread[q] / (spread * spread) + d_mean[p] * d_mean[q] / spread
+                )
+        for p in range(3):
+            d_gain = (d_variance[p] - gain * d_spread[p]) / spread
             d_mean[p] += d_gain * surprise - gain * d_mean[p]
             d_variance[p] = d_gain * white + gain * d_white[p]
         mean += gain * surprise
         variance = gain * white
-    return total, gradient
+    for p in range(3):
+        for q in range(p):
+            information[q, p] = information[p, q]
+    return total, gradient, information
+
+
+@njit(cache=True)
+def _bounded_step(
+    gradient: FloatArray, information: FloatArray, damping: float, low: FloatArray, high: FloatArray
+) -> FloatArray:
+    """Return the damped step of Fisher's scoring; where it would pass a bound it ends there, and the others follow from that."""
+    step = np.zeros(3)
+    held = np.zeros(3, dtype=np.bool_)
+    for p in range(3):
+        held[p] = (low[p] >= 0.0 and gradient[p] < 0.0) or (high[p] <= 0.0 and gradient[p] > 0.0)
+    for _ in range(4):
+        matrix, right = information.copy(), gradient.copy()
+        for p in range(3):
+            matrix[p, p] += damping * information[p, p] + LEAST_INFORMATION
+            if held[p]:
+                matrix[p, :] = 0.0
+                matrix[p, p], right[p] = 1.0, step[p]
+        step[:] = np.linalg.solve(matrix, right)
+        beyond = ~held & ((step < low) | (step > high))
+        if not beyond.any():
+            break
+        held |= beyond
+        step = np.minimum(np.maximum(step, low), high)
+    return step
+
+
+@njit(cache=True)
+def _climb(
+    step_s: FloatArray, residual: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return the greatest log-likelihood between bounds and where it is, by damped steps of Fisher's scoring from a start.
+
+    SciPy's minimisers ask for the likelihood some four times as often, and hand over from compiled code each time.
+    """
+    point = start.copy()
+    total, gradient, information = _score(step_s, residual, point)
+    damping = FIRST_DAMPING
+    for _ in range(MOST_STEPS):
+        down, up = np.maximum(low - point, -LONGEST_STEP), np.minimum(high - point, LONGEST_STEP)
+        step = _bounded_step(gradient, information, damping, down, up)
+        there = np.minimum(np.maximum(point + step, low), high)
+        next_total, next_gradient, next_information = _score(step_s, residual, there)
+        gained = next_total - total
+        if gained > 0.0:
+            point, total, gradient, information = there, next_total, next_gradient, next_information
+            damping = max(0.1 * damping, LEAST_DAMPING)
+        else:
+            damping *= 10.0
+        if 0.0 < gained < SETTLED_NATS or damping > MOST_DAMPING:
+            break
+    return total, point
 
 
 def fit(
@@ -227,23 +298,17 @@ def _fit_coloured(
         (np.log(floor), np.log(2.0 * spread)),
     ]
 
-    def objective(point: FloatArray) -> tuple[float, FloatArray]:
-        total, gradient = _score(steps, series, point)
-        return -total / series.size, -gradient / series.size
-
     differences = max(float(np.std(np.diff(series))) / np.sqrt(2.0), floor)
     low, high = np.array(bounds).T
     grid = [[spread, guess * step, share * differences] for guess in LENGTH_STARTS for share in WHITE_STARTS]
     if near is not None and near.sigma_ou > 0.0:
         grid = [[near.sigma_ou, near.length_s, near.sigma_white]]
-    starts = sorted((np.clip(np.log(point), low, high) for point in grid), key=lambda point: objective(point)[0])
-    climbs = [
-        minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
-        for start in starts[:CLIMBS]
-    ]
-    best = min(climbs, key=lambda climb: float(climb.fun))
-    sigma_ou, length, sigma_white = np.exp(best.x)
-    return ResidualNoise(float(sigma_ou), float(length), float(sigma_white), float(-best.fun * series.size))
+    starts = [np.clip(np.log(point), low, high) for point in grid]
+    if len(starts) > CLIMBS:
+        starts = sorted(starts, key=lambda point: -_score(steps, series, point)[0])[:CLIMBS]
+    total, best = max((_climb(steps, series, start, low, high) for start in starts), key=lambda climb: climb[0])
+    sigma_ou, length, sigma_white = np.exp(best)
+    return ResidualNoise(float(sigma_ou), float(length), float(sigma_white), float(total))
 
 
 def _checked(time_s: FloatArray, columns: FloatArray, valid: BoolArray) -> tuple[FloatArray, FloatArray, BoolArray]:

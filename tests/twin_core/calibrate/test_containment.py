@@ -46,7 +46,7 @@ SOLVERS = [
     "twin_core.calibrate.starting.least_squares",
     "twin_core.calibrate.starting.connected_components",
     "twin_core.calibrate.restricted.solve_triangular",
-    "twin_core.gp.noise_model.minimize",
+    "twin_core.gp.noise_model._climb",
     "twin_core.simulate.rollout.march",
     "twin_core.calibrate.problem.sensitivities",
     "numpy.linalg.solve",

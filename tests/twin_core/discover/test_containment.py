@@ -26,7 +26,7 @@ SOLVERS = (
     *(pytest.param(f"numpy.linalg.{name}", marks=pytest.mark.long) for name in ("solve", "pinv", "eigh")),
     "twin_core.calibrate.optimise.cho_factor",
     "twin_core.calibrate.optimise.cho_solve",
-    "twin_core.gp.noise_model.minimize",
+    "twin_core.gp.noise_model._climb",
     "twin_core.simulate.rollout.march",
     "twin_core.calibrate.problem.sensitivities",
     "twin_core.calibrate.undeclared.model.one_step",

@@ -126,3 +126,21 @@ def test_a_misfit_that_lasts_carries_no_refit_away() -> None:
     as_if_white, own = np.transpose([forward_error(case) for case in cases])
     assert np.mean(own) < np.mean(as_if_white)
     assert np.std(np.log(own)) < np.std(np.log(as_if_white)) / 3.0
+
+
+@pytest.mark.parametrize(
+    ("event", "first_left_out"),
+    [(-np.inf, 208), (0, 208), (160, 208), (200, 232), (256, 288), (288, 304), (310, 315), (318, 319)],
+)
+def test_what_follows_an_event_is_foretold_from_no_more_than_half_of_it(event: float, first_left_out: int) -> None:
+    """Of 320 samples the last 35 %, or what comes a tenth of the record after the event, or the second half of what follows."""
+    segments = calibrated(swinging()).problem.segments
+    event_s = event if np.isinf(event) else float(segments[0].record.clock_s[int(event)])
+    ((rows,),) = left_out._folds(segments, event_s)
+    assert int(np.flatnonzero(rows)[0]) == first_left_out and rows[first_left_out:].all()
+
+
+def test_nothing_is_left_to_foretell_of_an_event_after_the_end() -> None:
+    calibration = calibrated(swinging())
+    clock_s = calibration.problem.segments[0].record.clock_s
+    np.testing.assert_array_equal(forward_error(calibration, float(clock_s[-1]) + 1.0), 0.0)

@@ -176,16 +176,15 @@ def test_what_changes_between_sessions_is_no_law(gains: tuple[float, float], exp
     assert (validation.foresight < FORESIGHT) == is_law
 
 
-@pytest.mark.parametrize(("share", "foretells"), [(0.4, True), (0.645, True), (0.8, True), (0.95, False)])
-def test_what_follows_an_event_is_foretold_by_what_has_seen_it(share: float, *, foretells: bool) -> None:
-    """The usual beginning, 65 % of the record, knows nothing of an event at its end; after the last one nothing may follow."""
+@pytest.mark.parametrize("share", [0.4, 0.645, 0.8, 0.95])
+def test_what_follows_an_event_is_foretold_by_what_has_seen_it(share: float) -> None:
+    """The usual beginning, 65 % of the record, knows nothing of an event at its end."""
     base = declared(20.0, int(200 * share))
     clock = {"begin_s": 0.0, "span_s": 60.0 * 199, "width_s": 60.0, "dated": False}
     step = REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 15.0, "time": 60.0 * 200 * share}, clock)
     trial = try_effects(base, [step], n_passes=12)
     assert trial.effects[0].values["Q_W"] == pytest.approx(20.0, rel=0.2)
-    ratio = validate(base, trial).forward_ratio
-    assert ratio < 0.5 if foretells else ratio == 1.0
+    assert validate(base, trial).forward_ratio < 0.5
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from scipy.linalg import solve_triangular
+from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
 from twin_core.errors import ModelError
-from twin_core.gp.noise_model import ResidualNoise, _score, fit
+from twin_core.gp.noise_model import ResidualNoise, _climb, _score, fit
 
 
 def _covariance(times: np.ndarray, noise: ResidualNoise) -> np.ndarray:
@@ -50,7 +51,7 @@ def test_likelihood_and_gradient():
     times = np.cumsum(rng.uniform(0.2, 3.0, 40))
     residual = rng.normal(size=40)
     point = np.log([0.8, 5.0, 0.4])
-    total, gradient = _score(np.diff(times), residual, point)
+    total, gradient, _ = _score(np.diff(times), residual, point)
     cov = _covariance(times, ResidualNoise(0.8, 5.0, 0.4, 0.0))
     assert total == pytest.approx(multivariate_normal(np.zeros(40), cov).logpdf(residual), abs=1e-9)
     for p in range(3):
@@ -63,6 +64,44 @@ def test_likelihood_and_gradient():
         assert gradient[p] == pytest.approx((ahead - back) / 2e-5, abs=1e-6)
 
 
+def test_information_is_fishers_on_average() -> None:
+    """Against half the trace of (C^-1 dC)^2 by central differences of the dense covariance, over many series."""
+    truth, times = ResidualNoise(0.8, 5.0, 0.4, 0.0), np.cumsum(np.random.default_rng(5).uniform(0.2, 3.0, 40))
+    point, step = np.log([0.8, 5.0, 0.4]), 1e-5
+    slopes = []
+    for p in range(3):
+        ahead, back = (_covariance(times, ResidualNoise(*np.exp(point + s * np.eye(3)[p]), 0.0)) for s in (step, -step))
+        slopes.append(np.linalg.solve(_covariance(times, truth), (ahead - back) / (2.0 * step)))
+    expected = np.array([[0.5 * np.trace(a @ b) for b in slopes] for a in slopes])
+    drawn = [_score(np.diff(times), _simulate(seed, times, truth), point)[2] for seed in range(2000)]
+    np.testing.assert_allclose(np.mean(drawn, axis=0), expected, rtol=0.03, atol=0.03)
+
+
+def test_climbs_end_as_high_as_scipys() -> None:
+    """L-BFGS-B from the same start between the same bounds. Either may be caught; ours not more often."""
+    rng, gains = np.random.default_rng(6), []
+    times = np.arange(300.0)
+    for seed in range(200):
+        truth = ResidualNoise(1.0, 10.0 ** rng.uniform(-1.0, 4.0), 10.0 ** rng.uniform(-2.5, 0.5), 0.0)
+        residual, floor = _simulate(seed, times, truth), rng.choice([1e-3, 0.1])
+        spread, steps = max(float(np.sqrt(np.mean(residual**2))), floor), np.diff(times)
+        low, high = np.log([(1e-3 * floor, 30.0 * spread), (0.2, 10.0 * 299.0), (floor, 2.0 * spread)]).T
+        start = np.clip(np.log([0.6, 2.0 * truth.length_s, 1.5 * truth.sigma_white]), low, high)
+
+        def negative(
+            values: np.ndarray, steps: np.ndarray = steps, own: np.ndarray = residual
+        ) -> tuple[float, np.ndarray]:
+            total, gradient, _ = _score(steps, own, values)
+            return -total, -gradient
+
+        peer = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)))
+        total, point = _climb(steps, residual, start, low, high)
+        assert (low <= point).all() and (point <= high).all()
+        gains.append(total + float(peer.fun))
+    assert np.mean(np.abs(gains) < 0.01) > 0.9
+    assert np.sum(np.array(gains) < -0.01) <= np.sum(np.array(gains) > 0.01)
+
+
 @pytest.mark.parametrize("irregular", [False, True])
 def test_fit_recovers_the_noise(irregular):
     """The fit must beat the truth in likelihood and come near it; 2000 samples tell sigma_ou to about 20 %."""
@@ -73,7 +112,7 @@ def test_fit_recovers_the_noise(irregular):
     residual[500:600] = np.nan
     found = fit(times, residual, white_floor=1e-3)
     seen = np.isfinite(residual)
-    at_truth, _ = _score(np.diff(times[seen]), residual[seen], np.log([0.5, 30.0, 0.1]))
+    at_truth = _score(np.diff(times[seen]), residual[seen], np.log([0.5, 30.0, 0.1]))[0]
     assert found.log_likelihood >= at_truth
     assert found.sigma_ou == pytest.approx(0.5, rel=0.5)
     assert found.length_s == pytest.approx(30.0, rel=0.8)
