@@ -292,7 +292,7 @@ def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
         meaning = (
             "what rests tells nothing of capacities, and no effect is looked for beside it; if the sensor is stuck, take it out"
             if name in spec.sensors
-            else "the record cannot tell its heat from any other steady heat where it acts"
+            else "the record cannot tell its heat, if any, from other steady heat where it acts"
         )
         said.append(f"channel '{name}' never changes: {meaning}")
     return said
@@ -307,6 +307,16 @@ def resting(names: Iterable[str], records: Sequence[Record]) -> list[str]:
         if samples.size and np.ptp(samples) == 0.0:
             found.append(name)
     return found
+
+
+def nothing_is_heated(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
+    """Return in words that every power is zero throughout, where any is declared: what else seems wrong may come of that."""
+    names = list(dict.fromkeys(load.channel for load in spec.loads))
+    columns = [record.values.get(name) for record in records for name in names]
+    if not columns or any(column is None or np.nan_to_num(column).any() for column in columns):
+        return []
+    channels = f"power channel '{names[0]}' is" if len(names) == 1 else f"all power channels ({', '.join(names)}) are"
+    return [f"{channels} zero throughout: before anything else is believed, check whether powers were recorded"]
 
 
 def nothing_moves(spec: TwinSpec, records: Sequence[Record]) -> bool:

@@ -21,14 +21,12 @@ from twin_core.holdout import HeldOut, Prediction
 from twin_core.network.model import told_values
 from twin_core.report.dossier import Moment, ensemble, heat_flow_maps, left_out, sensitivity
 from twin_core.report.experiments import separating
+from twin_core.report.holdout_doubts import doubts
 from twin_core.telemetry import Record
 
 MOSTLY = 0.5
 """Share of a misfit from which it is said what explains it."""
 
-WORSE_THERE = 3.0
-"""A ratio of errors (rms), which decides about a notice only: a misfit of two noises makes it 2.2 by itself. Of 32 measured
-splits it tells of 10 (another room, runs of other kinds than those searched), half of it would tell of 24, twice of 6."""
 MOST_REJECTED = 8
 """Rows of what was tried and not supported."""
 
@@ -143,29 +141,6 @@ def best_rejected(search: Search) -> list[Judged]:
         if not places & found:
             once.setdefault(places, judged)
     return list(once.values())
-
-
-def _doubts(search: Search, scores: Sequence[Json]) -> list[str]:
-    """Return what the hold-out says against the findings: it chose nothing, so it may."""
-    before_K, after_K = (score["rmse_K"] for score in scores)
-    if not search.findings or after_K < before_K:
-        return []
-    return [
-        f"held-out error: {before_K:.3g} K before, {after_K:.3g} K after; it did not fall, so trust the findings only "
-        "where the hold-out is known to differ from the training record"
-    ]
-
-
-def _differs_there(score: Json, training_K: float) -> list[str]:
-    """Say that something may have begun in the part that was kept back, which no search has seen, if it fits far worse there."""
-    held_K = score["rmse_K"]
-    if held_K is None or not held_K > WORSE_THERE * training_K > 0.0:
-        return []
-    return [
-        f"the part that was kept back fits {held_K / training_K:.0f} times worse than what was searched ({held_K:.3g} K against "
-        f"{training_K:.3g} K): it differs in something that no search was shown; if the spacecraft may have changed, let the "
-        "search see some of it (a smaller holdout)"
-    ]
 
 
 def _left_out(search: Search) -> list[str]:
@@ -291,10 +266,9 @@ def build_report(
         "failures": list(dict.fromkeys(failures)),
         "words": after.summary["words"],
         "notices": [
-            *_doubts(search, scores),
+            *doubts(before.noise_K, scores[0], scores[1], after.summary["rmse_K"], found=bool(search.findings)),
             *_along_trajectories(search),
             *(attempted(lambda: _beside_gradients(search), "gradients within nodes", failures) or []),
-            *_differs_there(scores[1], after.summary["rmse_K"]),
             *_left_out(search),
             *_thinned(search),
             *dict.fromkeys([*before.summary["notices"], *(notice for h in held for notice in h.scored.notices)]),

@@ -7,7 +7,7 @@ import numpy as np
 
 from twin_core._typing import Json
 from twin_core.calibrate.containment import NO_DEADLINE
-from twin_core.calibrate.identifiability import nothing_moves
+from twin_core.calibrate.identifiability import nothing_is_heated, nothing_moves
 from twin_core.calibrate.second_order import Calibration
 from twin_core.calibrate.summary import stated_guesses
 from twin_core.calibrate.suspicions import (
@@ -110,11 +110,13 @@ def told_mistakes(search: Search, mistakes: Mistakes, report: Json) -> Json:
         complete=looked.complete and not search.findings,
         left_out=looked.left_out,
     )
+    problem = search.base.calibration().problem
     first = [line for line in words if line.startswith("perhaps ")]
+    unheated = nothing_is_heated(problem.network.spec, [segment.record for segment in problem.segments])
     return {
         "suspicions": [s.to_json() for s in better],
         "words": [*report["words"], *(line for line in words if line not in first)],
-        "notices": [*first, *notices],
+        "notices": [*unheated, *first, *notices],
     }
 
 

@@ -7,6 +7,7 @@ from tests.helpers import conductive_spec, record_of
 from twin_core.calibrate.identifiability import (
     blurred_levels,
     identified,
+    nothing_is_heated,
     resting_channels,
     strong_correlations,
     unseen_nodes,
@@ -102,6 +103,26 @@ def test_channels_at_rest_are_said() -> None:
     (said,) = resting_channels(spec, [record])
     assert said.startswith("channel 'T0' never changes") and "stuck" in said
     assert resting_channels(spec, [record, record_of(time_s, T0=291.0, T1=290.0)]) == []
+
+
+@pytest.mark.parametrize(
+    ("powers_W", "said"),
+    [
+        ({"P0": [0.0, 0.0], "P1": [0.0, 0.0]}, "all power channels (P0, P1) are zero throughout"),
+        ({"P0": [0.0, np.nan], "P1": [np.nan, 0.0]}, "all power channels (P0, P1) are zero throughout"),
+        ({"P0": [0.0, 0.0], "P1": [0.0, 1.0]}, ""),
+        ({"P0": [0.0, 0.0]}, ""),
+    ],
+    ids=["zero", "zero where it was read", "one heats", "one comes from elsewhere"],
+)
+def test_powers_that_are_all_zero_are_said(powers_W: dict[str, list[float]], said: str) -> None:
+    data = conductive_spec(2, [(0, 1)])
+    data["channels"] |= {name: {"kind": "power", "unit": "W"} for name in ("P0", "P1")}
+    data["loads"] = [{"channel": name, "node": node} for name, node in (("P0", "n0"), ("P1", "n1"))]
+    record = record_of(np.array([0.0, 60.0]), **{name: np.array(column) for name, column in powers_W.items()})
+    told = nothing_is_heated(load_spec(data), [record])
+    assert len(told) == bool(said) and all(line.startswith(said) for line in told)
+    assert nothing_is_heated(load_spec(conductive_spec(2, [(0, 1)])), [record]) == []
 
 
 BOUNDED = positive("C:b", "J/K", 100.0, bounds=(50.0, 200.0))

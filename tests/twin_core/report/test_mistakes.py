@@ -91,3 +91,20 @@ def test_a_mistake_of_the_data_that_explains_more_outdoes_findings(mistake: str,
     search.findings = []
     assert not Mistakes(looked).outdo(search)
     assert not Mistakes().outdo(search)
+
+
+@pytest.mark.parametrize("power_W", [0.0, 1.0])
+def test_that_nothing_is_heated_comes_before_what_may_come_of_it(
+    monkeypatch: pytest.MonkeyPatch, power_W: float
+) -> None:
+    base = calibration(np.full((40, 1), 9.0), {"T_1": "a"})
+    base.network.spec.loads = [SimpleNamespace(channel="P")]
+    base.network.parameters = SimpleNamespace(parameters=[])
+    base.problem.segments = [SimpleNamespace(record=SimpleNamespace(values={"P": np.full(40, power_W)}))]
+    monkeypatch.setattr(mistakes, "stated_guesses", lambda network: {})
+    monkeypatch.setattr(mistakes, "close_words", lambda *given, **named: ["perhaps two sensors are swapped"])
+    trial: Any = SimpleNamespace(calibration=lambda: base)
+    search: Any = SimpleNamespace(trial=trial, base=trial, findings=[])
+    told = told_mistakes(search, Mistakes(Looked([], 1, 1, complete=True)), {"words": [], "notices": []})
+    first = ["power channel 'P' is zero throughout"] if power_W == 0.0 else []
+    assert [line.split(":")[0] for line in told["notices"]] == [*first, "perhaps two sensors are swapped"]
