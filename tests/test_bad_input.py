@@ -291,9 +291,28 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("forecast --model absent.json --telemetry data.csv --horizon 60 --out x.csv", "absent.json: cannot be read"),
     ("forecast --model spec.json --telemetry data.csv --horizon 60 --out x.csv", "spec.json: format: not a model"),
     ("forecast --model model.json --telemetry data.csv --horizon soon --out x.csv", "--horizon"),
-    ("forecast --model model.json --telemetry data.csv --horizon -60 --out x.csv", "horizon_s: must be a positive"),
-    ("forecast --model model.json --telemetry data.csv --horizon inf --out x.csv", "horizon_s: must be a positive"),
-    ("forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv", "step_s: must be positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon -60 --out x.csv", "'--horizon': '-60' is no positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon inf --out x.csv", "'--horizon': 'inf' is no positive"),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv",
+        "'--step': '0' is no positive",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 60 --step 2min --out x.csv",
+        "'--step': must be positive and at most the horizon of 60 s; it is 120 s",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 59 --out x.csv",
+        "'--step': must be positive and at most the horizon of 59 s; it is 60 s (default: the sampling interval)",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 1d --step 0.001 --out x.csv",
+        "'--step': 86400000 points asked for",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 9999999w --step 9999w --out x.csv",
+        "'--horizon': 6.048e+12 s are",
+    ),
     ("forecast --model model.json --telemetry data.csv copy.csv --horizon 60 --out x.csv", "copy.csv: a forecast"),
     ("forecast --model model.json --telemetry data.csv --horizon 60 --out x.txt", "x.txt: the name must end in"),
     ("forecast --model model.json --telemetry one.csv --horizon 60 --out x.csv", "one.csv: holds one sample"),
