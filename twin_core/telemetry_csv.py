@@ -16,6 +16,7 @@ from twin_core.network.spec import Channel, TwinSpec
 from twin_core.quality.sentinels import marked
 from twin_core.telemetry import LEAST_PART, Record
 from twin_core.units import calendar_instant, from_si, to_si
+from twin_core.wording import counted
 
 TIME, TIME_S = "time", "time_s"
 _FIRST_YEAR, _LAST_YEAR = 1970, 2199
@@ -93,11 +94,11 @@ def _first_of_instants(
         other |= both & (column[repeats] != column[repeats - 1])
     same, differing = int((~other).sum()), int(other.sum())
     if same:
-        notices.append(f"{name}: {same} row(s) repeat the instant and the values of the row before; dropped")
+        repeat = counted(same, "row repeats", "rows repeat")
+        notices.append(f"{name}: {repeat} the instant and the values of the row before; dropped")
     if differing:
-        notices.append(
-            f"{name}: {differing} row(s) repeat the instant of the row before with other values; the first stays"
-        )
+        repeat = counted(differing, "row repeats", "rows repeat")
+        notices.append(f"{name}: {repeat} the instant of the row before with other values; the first stays")
     return np.setdiff1d(np.arange(clock.size), repeats)
 
 
@@ -113,9 +114,9 @@ def _forward_runs(table: CsvTable, clock: IntArray | FloatArray, kept: IntArray,
     long = [run for run in runs if run.size >= LEAST_PART]
     if not long:
         table.refuse(int(kept[back[0]]), table.header[0], "is earlier than the row before; sort the rows by time")
-    said = f"{table.name}: the clock jumps back {back.size} time(s), first in row {table.line[kept[back[0]]]}"
+    said = f"{table.name}: the clock jumps back {counted(back.size, 'time')}, first in row {table.line[kept[back[0]]]}"
     scraps = sum(run.size for run in runs) - sum(run.size for run in long)
-    left_out = f"; {scraps} row(s) between jumps are left out" if scraps else ""
+    left_out = f"; {counted(scraps, 'row between jumps is', 'rows between jumps are')} left out" if scraps else ""
     notices.append(f"{said}; a new segment begins at each{left_out}")
     return long
 

@@ -63,6 +63,7 @@ def forecast(
     from replay.cli.recordings import check_suffix, load_segments
     from twin_core.errors import ArgumentError, TelemetryError
     from twin_core.forecast import forecast as look_ahead
+    from twin_core.wording import counted
 
     check_suffix(out, _OUT)
     if len(telemetry) > 1:
@@ -82,7 +83,7 @@ def forecast(
     if as_json:
         print_line(to_json(document).rstrip())
     else:
-        print_line(f"{out}: {len(result.time_s)} instants of {len(result.sensors)} sensors")
+        print_line(f"{out}: {counted(len(result.time_s), 'instant')} of {counted(len(result.sensors), 'sensor')}")
 
 
 def _load_plan(path: Path, record: "Record", model: "CalibratedModel", horizon_s: float) -> "Record":

@@ -27,6 +27,7 @@ from twin_core.telemetry_csv import (
     write_columns,
 )
 from twin_core.units import format_instant, from_si, to_si
+from twin_core.wording import counted
 
 if TYPE_CHECKING:
     from twin_core.fem.film import Film
@@ -77,7 +78,7 @@ def _segments_of(path: Path, spec: TwinSpec) -> list[Record]:
         return read_segments(path, spec)
     segments = [_from_recording(path, part, spec, None) for part in read_mcap_segments(path)]
     if len(segments) > 1:
-        said = f"{path}: the clock jumps back {len(segments) - 1} time(s); a new segment begins at each"
+        said = f"{path}: the clock jumps back {counted(len(segments) - 1, 'time')}; a new segment begins at each"
         segments[0] = replace(segments[0], notices=(*segments[0].notices, said))
     return segments
 
