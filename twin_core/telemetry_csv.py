@@ -46,7 +46,7 @@ def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str]
     path
         CSV with a header row; the first column is ``time`` (RFC 3339, or with the day of the year) or ``time_s``
         (seconds), each other one a channel. An empty cell is a missing sample. Columns that the specification does not
-        declare are ignored.
+        declare are ignored. Where all of three rows and more carry one instant, the clock stands still: an error.
     spec
         Declares the channels and their units.
     required
@@ -72,6 +72,7 @@ def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str]
     values = {name: _in_si(table, name, spec.channels[name], column) for name, column in table.numbers(names).items()}
     notices = list(ignored_notice(str(path), table.header[1:], spec))
     kept = _first_of_instants(str(path), clock, values, notices)
+    _refuse_standing_clock(table, kept)
     segments: list[Record] = []
     for rows in _forward_runs(table, clock, kept, notices):
         epoch_ns = int(clock[rows[0]]) if dated else None
@@ -100,6 +101,16 @@ def _first_of_instants(
         repeat = counted(differing, "row repeats", "rows repeat")
         notices.append(f"{name}: {repeat} the instant of the row before with other values; the first stays")
     return np.setdiff1d(np.arange(clock.size), repeats)
+
+
+def _refuse_standing_clock(table: CsvTable, kept: IntArray) -> None:
+    """Refuse a file all of whose rows carry one instant; two of them may be one sample that was sent twice."""
+    if kept.size == 1 and table.line.size > 2:
+        time, at = table.header[0], table.texts(table.header[0])[0]
+        raise TelemetryError(
+            f"{table.name}: column '{time}': all {table.line.size} rows have the same time, {at}; give each row the time of "
+            "its own sample"
+        )
 
 
 def _forward_runs(table: CsvTable, clock: IntArray | FloatArray, kept: IntArray, notices: list[str]) -> list[IntArray]:

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 DATED = "dated"
 """Metadata of an MCAP file: "false" where log times are seconds since an unknown start."""
 SUFFIXES = (".csv", ".mcap")
+LEAST_SAMPLES = 20
+"""So many samples a calibration should have, and a part of a record that is asked for must have."""
 _TEMPERATURE_UNITS = ("K", "degC")
 
 
@@ -111,6 +113,18 @@ def load_records(paths: Sequence[Path], spec: TwinSpec, *, masking: bool = True)
     if records:
         _check_sampled(spec, records)
     return records
+
+
+def too_short(records: Sequence[Record]) -> list[str]:
+    """Return a notice of records that have too few samples to determine parameters."""
+    count = sum(record.time_s.size for record in records)
+    if not records or count >= LEAST_SAMPLES:
+        return []
+    names = ", ".join(dict.fromkeys(record.name for record in records))
+    return [
+        f"{names}: {counted(count, 'sample')} in all, too few to determine parameters reliably; give at least "
+        f"{LEAST_SAMPLES} samples, better those of an orbit or of several time constants"
+    ]
 
 
 def _check_sampled(spec: TwinSpec, records: Sequence[Record]) -> None:
