@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.errors import RecordingError
+from replay.wording import counted
 
 
 @dataclass(frozen=True)
@@ -82,6 +83,9 @@ def align(series: Mapping[str, tuple[NDArray[np.int64], NDArray[np.float64]]]) -
 
 def _of_repeats(same: int, differing: int) -> Iterator[str]:
     if same:
-        yield f"{same} sample(s) repeat the instant and the value of an earlier one; dropped"
+        yield f"{counted(same, *_REPEAT)} the instant and the value of an earlier one; dropped"
     if differing:
-        yield f"{differing} sample(s) repeat the instant of an earlier one with another value; the first stays"
+        yield f"{counted(differing, *_REPEAT)} the instant of an earlier one with another value; the first stays"
+
+
+_REPEAT = ("sample repeats", "samples repeat")

@@ -209,9 +209,16 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
     (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,293,5,6\n", "row 3: has 5 fields, the header has 4"),
     (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,warm,293,5\n", "row 3: column 'T_a' holds 'warm'"),
     (HEAD + "\n\n" + ROW.format(0) + "2026-01-01T00:01:00Z,20,293,on\n", "row 5: column 'Q_a' holds 'on'"),
-    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,inf,293,5\n", "row 3: column 'T_a'"),
+    (
+        HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,inf,293,5\n",
+        "row 3: column 'T_a' holds 'inf', which is not a finite number; correct it, or leave the cell empty where a sample is",
+    ),
+    (
+        HEAD.replace("time", "time_s") + "inf,20,293,5\n",
+        "column 'time_s' holds 'inf', which is not a finite number; correct it\n",
+    ),
     (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,nan,293,5\n", "row 3: column 'T_a' holds 'nan'"),
-    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,1e999,5\n", "row 3: column 'T_b'"),
+    (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,1e999,5\n", "row 3: column 'T_b' holds '1e999'"),
     (HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,-300,293,5\n", "row 3: column 'T_a' holds -300 degC, which is below"),
     (
         HEAD + ROW.format(0) + "2026-01-01T00:01:00Z,20,-1,5\n",
@@ -228,7 +235,13 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
     (HEAD.replace("time", "time_s") + "0,20,293,5\n,20,293,5\n", "row 3: column 'time_s' is empty"),
     (HEAD.replace("time", "time_s") + "soon,20,293,5\n", "row 2: column 'time_s' holds 'soon'"),
     (HEAD + '2026-01-01T00:00:00Z,"20,293,5\n', "row 2: "),
-    (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples"),
+    (HEAD + ROW.format(0) + ROW.format(1), "fewer than three usable samples of T_a, T_b; give a longer record"),
+    (HEAD + "".join(map(ROW.format, range(4))), "8 readings are too few to determine 5 unknowns"),
+    (
+        HEAD + "".join(f"2026-01-01T00:00:00Z,{20 + k},293,5\n" for k in range(10)),
+        "all 10 rows have the same time, 2026-01-01T00:00:00Z; give each row the time of its own sample",
+    ),
+    (HEAD.replace("time", "time_s") + 3 * "7,20,293,5\n", "column 'time_s': all 3 rows have the same time, 7; give"),
     (HEAD + "2026-01-01T00:00:00Z,20,,5\n2026-01-01T00:01:00Z,20,,5\n", "channel 'T_b' has no samples"),
     (HEAD + "2026-01-01T00:00:00Z,20,0,5\n2026-01-01T00:01:00Z,20,0,5\n", "all its samples are masked (sentinel)"),
     (HEAD + "2026-01-01T00:00:00Z,20,293,\n2026-01-01T00:01:00Z,20,293,\n", "channel 'Q_a' has no samples"),
@@ -263,7 +276,7 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --holdout half", "--holdout"),
     (
         "close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 0.9999",
-        "data.csv: a hold-out of 0.9999 leaves 1 sample to train on",
+        "data.csv: a hold-out of 0.9999 leaves 1 sample to train on, 10 are needed; choose another hold-out, or give a longer",
     ),
     (
         "close-loop --spec spec.yaml --telemetry data.csv --out x --holdout 0.01",
@@ -271,7 +284,15 @@ ARGUMENTS: list[tuple[str, str]] = [
     ),
     (
         "close-loop --spec spec.yaml --telemetry lone.csv --out x",
-        "lone.csv: 1 instant in all cannot be split by a hold-out of 0.3; give longer telemetry",
+        "lone.csv: 1 sample in all, too few for a hold-out: 10 to train on and 3 to predict are needed; give a longer record",
+    ),
+    (
+        "close-loop --spec spec.yaml --telemetry ten.csv --out x --holdout 0.1",
+        "ten.csv: 10 samples in all, too few for a hold-out: 10 to train on and 3 to predict are needed; give a longer record",
+    ),
+    (
+        "close-loop --spec spec.yaml --telemetry data.csv --holdout-telemetry ten.csv --out x",
+        "ten.csv: a burn-in of 10 of its 10 samples leaves fewer than two to score; give a longer hold-out",
     ),
     ("close-loop --spec spec.yaml --telemetry data.csv --out x --burn-in 9", "--burn-in belongs to"),
     ("close-loop --spec spec.yaml --telemetry data.csv --out data.csv", "--out data.csv is a file"),
@@ -291,9 +312,28 @@ ARGUMENTS: list[tuple[str, str]] = [
     ("forecast --model absent.json --telemetry data.csv --horizon 60 --out x.csv", "absent.json: cannot be read"),
     ("forecast --model spec.json --telemetry data.csv --horizon 60 --out x.csv", "spec.json: format: not a model"),
     ("forecast --model model.json --telemetry data.csv --horizon soon --out x.csv", "--horizon"),
-    ("forecast --model model.json --telemetry data.csv --horizon -60 --out x.csv", "horizon_s: must be a positive"),
-    ("forecast --model model.json --telemetry data.csv --horizon inf --out x.csv", "horizon_s: must be a positive"),
-    ("forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv", "step_s: must be positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon -60 --out x.csv", "'--horizon': '-60' is no positive"),
+    ("forecast --model model.json --telemetry data.csv --horizon inf --out x.csv", "'--horizon': 'inf' is no positive"),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 60 --step 0 --out x.csv",
+        "'--step': '0' is no positive",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 60 --step 2min --out x.csv",
+        "'--step': must be positive and at most the horizon of 60 s; it is 120 s",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 59 --out x.csv",
+        "'--step': must be positive and at most the horizon of 59 s; it is 60 s (default: the sampling interval)",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 1d --step 0.001 --out x.csv",
+        "'--step': 86400000 points asked for",
+    ),
+    (
+        "forecast --model model.json --telemetry data.csv --horizon 9999999w --step 9999w --out x.csv",
+        "'--horizon': 6.048e+12 s are",
+    ),
     ("forecast --model model.json --telemetry data.csv copy.csv --horizon 60 --out x.csv", "copy.csv: a forecast"),
     ("forecast --model model.json --telemetry data.csv --horizon 60 --out x.txt", "x.txt: the name must end in"),
     ("forecast --model model.json --telemetry one.csv --horizon 60 --out x.csv", "one.csv: holds one sample"),
@@ -370,6 +410,8 @@ def desk(
     (tmp_path / "data.txt").write_text(pair_telemetry(40))
     (tmp_path / "copy.csv").write_text(pair_telemetry(40))
     (tmp_path / "lone.csv").write_text("".join(pair_telemetry(40).splitlines(keepends=True)[:2]))
+    late = pair_telemetry(50).splitlines(keepends=True)
+    (tmp_path / "ten.csv").write_text(late[0] + "".join(late[-10:]))
     (tmp_path / "undated.csv").write_text("time_s,T_a,T_b,Q_a\n0,20,293,5\n")
     (tmp_path / "one.csv").write_text(pair_telemetry(1))
     (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(40))

@@ -222,7 +222,7 @@ def _corrected(whole: Trial, found: Search, held: Sequence[HeldOut]) -> tuple[Ca
 
 def _stated(model: CalibratedModel, found: Search, trial: Trial, deadline: float) -> CalibratedModel:
     """Return a model whose deviations hold what a coarse network makes its parameters wrong by; told where they do not."""
-    what = "what a coarse network makes parameters wrong by"
+    what = "parameter errors caused by the coarse network"
     try:
         with limited(deadline), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             told = attempted(trial.discrepancy, what, found.failures)

@@ -48,12 +48,13 @@ class CsvTable:
             return {}
         try:
             frame = self._parse(columns, "float64")
-        except ValueError:  # some cell is not a number; find out which
+            parsed = {name: frame[name].to_numpy() for name in columns}
+        except ValueError:
+            parsed = {}
+        if not parsed or any(
+            np.isinf(column).any() for column in parsed.values()
+        ):  # some cell is wrong; find out which
             return {name: self._one_by_one(name) for name in columns}
-        parsed = {name: frame[name].to_numpy() for name in columns}
-        for name, column in parsed.items():
-            if np.isinf(column).any():
-                self.refuse(int(np.argmax(np.isinf(column))), name, "is not a finite number")
         return parsed
 
     def texts(self, column: str) -> list[str]:
@@ -89,14 +90,15 @@ class CsvTable:
 
     def _number(self, row: int, name: str, text: str) -> float:
         shown = text if len(text) <= 40 else f"{text[:37]}..."
+        mend = (
+            "correct it" if name == self.header[0] else "correct it, or leave the cell empty where a sample is missing"
+        )
         try:
             value = float(text.replace("_", "x"))  # Python alone would read 1_000
         except ValueError:
-            self.refuse(row, name, f"holds '{shown}', which is not a number; correct it or leave the cell empty")
+            self.refuse(row, name, f"holds '{shown}', which is not a number; {mend}")
         if not np.isfinite(value):
-            self.refuse(
-                row, name, f"holds '{shown}', which is not a finite number; leave the cell of a missing sample empty"
-            )
+            self.refuse(row, name, f"holds '{shown}', which is not a finite number; {mend}")
         return value
 
 

@@ -31,6 +31,19 @@ class ModelError(TwinError):
     """A request that the network or the model cannot answer, such as a node that does not exist."""
 
 
+class ArgumentError(ModelError):
+    """An argument of a function is out of range. The command line names its own option instead of ``argument``."""
+
+    def __init__(self, argument: str, reason: str) -> None:
+        """Keep both; the message is ``argument: reason``."""
+        super().__init__(argument, reason)
+        self.argument, self.reason = argument, reason
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return f"{self.argument}: {self.reason}"
+
+
 class NoSolutionError(ModelError):
     """The declared model has no solution from any start: the command line shows it in one line and exits with 1."""
 

@@ -15,6 +15,7 @@ from twin_core.simulate.extrapolation import extrapolations, in_words
 from twin_core.simulate.forcing import build_forcing
 from twin_core.simulate.rollout import Rollout, rollout
 from twin_core.telemetry import Record
+from twin_core.wording import counted
 
 DEFAULT_BURN_IN_SHARE = 0.05
 MIN_BURN_IN_SAMPLES = 10
@@ -59,6 +60,12 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
     """
     if not 0.0 < fraction < 1.0:
         raise TelemetryError(f"holdout: must be between 0 and 1, exclusive (got {fraction:g})")
+    names, n_samples = ", ".join(r.name for r in records), sum(r.time_s.size for r in records)
+    if n_samples < MIN_BURN_IN_SAMPLES + MIN_HELD_SAMPLES:
+        raise TelemetryError(
+            f"{names}: {counted(n_samples, 'sample')} in all, too few for a hold-out: {MIN_BURN_IN_SAMPLES} to train on and "
+            f"{MIN_HELD_SAMPLES} to predict are needed; give a longer record"
+        )
     spans = np.array([float(r.time_s[-1] - r.time_s[0]) for r in records])
     kept = (1.0 - fraction) * spans.sum()
     train: list[Record] = []
@@ -78,10 +85,8 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
             held.append(HeldOut(lead, record.take(np.arange(record.time_s.size) >= before.sum() - 1)))
         kept -= span
     if not train or not held:
-        names, n_instants = ", ".join(r.name for r in records), sum(r.time_s.size for r in records)
         raise TelemetryError(
-            f"{names}: {n_instants} instant{'s' if n_instants != 1 else ''} in all cannot be split by a hold-out of {fraction:g};"
-            " give longer telemetry"
+            f"{names}: cannot be split by a hold-out of {fraction:g}; choose a larger one, or put single samples into one file"
         )
     return train, held
 
@@ -90,9 +95,9 @@ def _check_parts(name: str, fraction: float, n_train: int, n_held: int) -> None:
     """Refuse a cut that leaves either part too short."""
     for count, least, purpose in ((n_train, MIN_BURN_IN_SAMPLES, "train on"), (n_held, MIN_HELD_SAMPLES, "predict")):
         if count < least:
-            samples = f"{count} sample{'s' if count != 1 else ''}"
             raise TelemetryError(
-                f"{name}: a hold-out of {fraction:g} leaves {samples} to {purpose}, {least} are needed; choose another"
+                f"{name}: a hold-out of {fraction:g} leaves {counted(count, 'sample')} to {purpose}, {least} are needed; "
+                "choose another hold-out, or give a longer record"
             )
 
 
@@ -108,7 +113,10 @@ def split_burn_in(record: Record, burn_in_s: float | None) -> HeldOut:
         last = max(last, MIN_BURN_IN_SAMPLES)
     last = max(last, 1)
     if record.time_s.size - last < 2:
-        raise TelemetryError(f"{record.name}: nothing is left to score after a burn-in of {seconds:g} s")
+        raise TelemetryError(
+            f"{record.name}: a burn-in of {last} of its {record.time_s.size} samples leaves fewer than two to score; "
+            "give a longer hold-out, or a shorter burn-in"
+        )
     return HeldOut(
         record.take(np.arange(record.time_s.size) < last), record.take(np.arange(record.time_s.size) >= last - 1)
     )

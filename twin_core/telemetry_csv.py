@@ -16,6 +16,7 @@ from twin_core.network.spec import Channel, TwinSpec
 from twin_core.quality.sentinels import marked
 from twin_core.telemetry import LEAST_PART, Record
 from twin_core.units import calendar_instant, from_si, to_si
+from twin_core.wording import counted
 
 TIME, TIME_S = "time", "time_s"
 _FIRST_YEAR, _LAST_YEAR = 1970, 2199
@@ -45,7 +46,7 @@ def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str]
     path
         CSV with a header row; the first column is ``time`` (RFC 3339, or with the day of the year) or ``time_s``
         (seconds), each other one a channel. An empty cell is a missing sample. Columns that the specification does not
-        declare are ignored.
+        declare are ignored. Where all of three rows and more carry one instant, the clock stands still: an error.
     spec
         Declares the channels and their units.
     required
@@ -71,6 +72,7 @@ def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str]
     values = {name: _in_si(table, name, spec.channels[name], column) for name, column in table.numbers(names).items()}
     notices = list(ignored_notice(str(path), table.header[1:], spec))
     kept = _first_of_instants(str(path), clock, values, notices)
+    _refuse_standing_clock(table, kept)
     segments: list[Record] = []
     for rows in _forward_runs(table, clock, kept, notices):
         epoch_ns = int(clock[rows[0]]) if dated else None
@@ -93,12 +95,22 @@ def _first_of_instants(
         other |= both & (column[repeats] != column[repeats - 1])
     same, differing = int((~other).sum()), int(other.sum())
     if same:
-        notices.append(f"{name}: {same} row(s) repeat the instant and the values of the row before; dropped")
+        repeat = counted(same, "row repeats", "rows repeat")
+        notices.append(f"{name}: {repeat} the instant and the values of the row before; dropped")
     if differing:
-        notices.append(
-            f"{name}: {differing} row(s) repeat the instant of the row before with other values; the first stays"
-        )
+        repeat = counted(differing, "row repeats", "rows repeat")
+        notices.append(f"{name}: {repeat} the instant of the row before with other values; the first stays")
     return np.setdiff1d(np.arange(clock.size), repeats)
+
+
+def _refuse_standing_clock(table: CsvTable, kept: IntArray) -> None:
+    """Refuse a file all of whose rows carry one instant; two of them may be one sample that was sent twice."""
+    if kept.size == 1 and table.line.size > 2:
+        time, at = table.header[0], table.texts(table.header[0])[0]
+        raise TelemetryError(
+            f"{table.name}: column '{time}': all {table.line.size} rows have the same time, {at}; give each row the time of "
+            "its own sample"
+        )
 
 
 def _forward_runs(table: CsvTable, clock: IntArray | FloatArray, kept: IntArray, notices: list[str]) -> list[IntArray]:
@@ -113,9 +125,9 @@ def _forward_runs(table: CsvTable, clock: IntArray | FloatArray, kept: IntArray,
     long = [run for run in runs if run.size >= LEAST_PART]
     if not long:
         table.refuse(int(kept[back[0]]), table.header[0], "is earlier than the row before; sort the rows by time")
-    said = f"{table.name}: the clock jumps back {back.size} time(s), first in row {table.line[kept[back[0]]]}"
+    said = f"{table.name}: the clock jumps back {counted(back.size, 'time')}, first in row {table.line[kept[back[0]]]}"
     scraps = sum(run.size for run in runs) - sum(run.size for run in long)
-    left_out = f"; {scraps} row(s) between jumps are left out" if scraps else ""
+    left_out = f"; {counted(scraps, 'row between jumps is', 'rows between jumps are')} left out" if scraps else ""
     notices.append(f"{said}; a new segment begins at each{left_out}")
     return long
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from replay.bridges.errors import BadTimeError, BridgeError
 from replay.bridges.time_scales import Instants, Stated, from_numbers, from_texts
 from replay.recording import Recording, align
+from replay.wording import counted
 
 FloatArray = NDArray[np.float64]
 FORMATS = {
@@ -105,15 +106,17 @@ def _numbers(name: str, texts: Sequence[str]) -> tuple[FloatArray | None, list[s
             column[row] = float(text) if text else np.nan
         except ValueError:
             words[text] += 1
-    if np.isinf(column).any():
-        column[np.isinf(column)] = np.nan
-        words["inf"] += 1
+    infinite = np.isinf(column)
+    if infinite.any():
+        column[infinite] = np.nan
+        words["inf"] += int(infinite.sum())
     if not words:
         return column, []
     shown = ", ".join(f"'{word[:20]}'" for word, _ in words.most_common(3))
     if np.isnan(column).all():
         return None, [f"column '{name}' holds no numbers ({shown}); left out"]
-    return column, [f"column '{name}': {words.total()} cell(s) are no numbers ({shown}); left out"]
+    cells = counted(words.total(), "cell is not a number", "cells are not numbers")
+    return column, [f"column '{name}': {cells} ({shown}); left out"]
 
 
 def _read_parquet(path: Path, wish: Wish) -> Recording:
@@ -128,7 +131,7 @@ def _read_parquet(path: Path, wish: Wish) -> Recording:
     time_name = _time_name(path, table.column_names, wish)
     times, kind = table.column(time_name), table.schema.field(time_name).type
     if times.null_count:
-        raise BridgeError(f"{path}: the time is missing in {times.null_count} row(s)")
+        raise BridgeError(f"{path}: the time is missing in {counted(times.null_count, 'row')}")
     if pa.types.is_timestamp(kind):
         readings = times.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy()
         instants = _of_timestamps(path, readings, kind.tz, wish.stated)
@@ -178,7 +181,7 @@ def _read_ccsds(path: Path, wish: Wish) -> Recording:
     if not packets:
         raise BridgeError(f"{path}: is no sequence of whole CCSDS packets")
     found = _from_packets(path, packets, wish, None)
-    said = (f"{path}: the last {left} byte(s) are no whole packet; left out",) if left else ()
+    said = (f"{path}: {counted(left, 'byte')} at the end: not a whole packet; left out",) if left else ()
     return Recording(found.time_ns, found.columns, found.units, {}, (*found.notices, *said))
 
 
@@ -213,9 +216,10 @@ def _from_packets(path: Path, packets: Sequence[bytes], wish: Wish, received: Se
                 series.setdefault(name, []).append((len(times) - 1, float(number)))
     if not times:
         what = "" if received is not None else f" with the parameter '{wish.time}'"
-        raise BridgeError(f"{path}: {len(packets)} packet(s), none of which the XTCE describes{what}")
-    notices = [f"{unknown} packet(s) that the XTCE does not describe; left out"] if unknown else []
-    notices += [f"{broken} packet(s) that do not fit their definition; left out"] if broken else []
+        raise BridgeError(f"{path}: {counted(len(packets), 'packet')}, none of which the XTCE describes{what}")
+    notices = [f"{counted(unknown, 'packet')} that the XTCE does not describe; left out"] if unknown else []
+    misfits = counted(broken, "packet that does", "packets that do")
+    notices += [f"{misfits} not fit the definition; left out"] if broken else []
     if received is None:
         instants = _packet_times(path, times, definition, wish)
     else:
@@ -298,7 +302,7 @@ def _read_frames(path: Path, wish: Wish) -> Recording:
             series[name][1].append(value)
     if not series:
         raise BridgeError(f"{path}: no frame is decoded; frames as hex need the XTCE that describes them (--xtce)")
-    notices = [f"{without} frame(s) are not decoded; left out"] if without else []
+    notices = [f"{counted(without, 'frame is', 'frames are')} not decoded; left out"] if without else []
     columns = {name: (np.array(at, dtype=np.int64), np.array(values)) for name, (at, values) in series.items()}
     return _told(path, align(columns), units, [*instants.notices, *notices])
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from replay.bridges.errors import BadTimeError, BridgeError
+from replay.wording import counted
 
 IntArray = NDArray[np.int64]
 NS = 1_000_000_000
@@ -81,11 +82,16 @@ def from_texts(texts: Sequence[str], stated: Stated, name: str) -> Instants:
             raise BadTimeError(name, row, f"'{text}' is UTC by its zone, --time-scale says {stated.scale}")
         readings[row], leap = _reading(match, name, row)
         leaps += leap
-    notices = [f"{name}: {leaps} time(s) within a leap second count as the second after it"] if leaps else []
+    notices = [_in_leap_seconds(name, leaps)] if leaps else []
     scale = stated.scale or "utc"
     if leaps and scale != "utc":
         raise BridgeError(f"{name}: a second 60 in {scale}, which has none")
     return _finish(readings, scale, name, notices)
+
+
+def _in_leap_seconds(name: str, times: int) -> str:
+    found = counted(times, "time within a leap second counts", "times within leap seconds count")
+    return f"{name}: {found} as the second after it"
 
 
 def _reading(match: re.Match[str], name: str, row: int) -> tuple[int, bool]:
@@ -148,7 +154,7 @@ def _finish(readings: IntArray, scale: str, name: str, notices: list[str]) -> In
         following = np.minimum(before + 1, STEPS_NS.size - 1)
         within = int(np.sum((unix_ns >= STEPS_NS[following]) & (following > before)))
         if within:
-            notices.append(f"{name}: {within} time(s) within a leap second count as the second after it")
+            notices.append(_in_leap_seconds(name, within))
         if unix_ns.size and unix_ns.max() > int(np.datetime64(KNOWN_UNTIL, "ns").astype(np.int64)):
             notices.append(
                 f"{name}: TAI - UTC is taken as 37 s after {KNOWN_UNTIL}, up to where leap seconds are known here"

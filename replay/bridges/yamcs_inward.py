@@ -14,6 +14,7 @@ from replay.bridges.instants import parse_utc_ms, service_ms, to_text
 from replay.bridges.twin_side import TwinSide
 from replay.bridges.yamcs_gateway import Row, YamcsGateway
 from replay.bridges.yamcs_wiring import Wiring, wire
+from replay.wording import counted
 from service.schemas import TwinDetail
 
 BATCH = 2000
@@ -132,7 +133,7 @@ class Inward:
         self._tally.quarantined += len(report.quarantined)
         for reason, found in _grouped((item.reason, item.index) for item in report.rejected).items():
             first = instants[found[0]]
-            self._tell(f"{len(found)} sample(s) refused by the service, the first at {first}: {reason}")
+            self._tell(f"{counted(len(found), 'sample')} refused by the service, the first at {first}: {reason}")
         if report.quarantined:
             first = instants[report.quarantined[0].index]
             self._tell(f"samples from {first} on lie ahead of the service's clock")

@@ -114,6 +114,7 @@ def xtce(config: Path, service: str, key: str | None, out: Path) -> None:
     _need("yamcs", "Yamcs' client", "yamcs")
     from replay.bridges.yamcs_mdb import write_xtce
     from replay.bridges.yamcs_names import published_names
+    from twin_core.wording import counted
 
     try:
         with TwinClient(service, key) as client:
@@ -121,7 +122,7 @@ def xtce(config: Path, service: str, key: str | None, out: Path) -> None:
     except (ApiError, Unreachable) as error:
         raise ReplayError(f"twin '{settings.twin}': {error}") from error
     write_text(out, write_xtce(settings, twin))
-    print_line(f"wrote {out}: {len(published_names(settings, twin))} parameters below {settings.root}")
+    print_line(f"wrote {out}: {counted(len(published_names(settings, twin)), 'parameter')} below {settings.root}")
 
 
 @bridge.command(

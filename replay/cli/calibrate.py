@@ -77,7 +77,7 @@ def calibrate(
 ) -> None:
     """Calibrate the declared network against telemetry, with the uncertainty of every parameter."""
     from replay.cli.console import notify, print_line, progress_bar, to_json
-    from replay.cli.recordings import check_suffix, load_records
+    from replay.cli.recordings import check_suffix, load_records, too_short
     from replay.cli.selection import Wanted, selected
     from twin_core.calibrate import calibrate as fit
     from twin_core.calibrate.compiled import deadline_after
@@ -96,7 +96,7 @@ def calibrate(
     with progress_bar("calibrating") as progress:
         model = fit(spec, records, method=method, loss=loss, deadline=until, training=training, progress=progress)
     write_text(out, to_json(model.to_json()))
-    notify(model.summary["notices"])
+    notify([*too_short(records), *model.summary["notices"]])
     if as_json:
         print_line(to_json({"out": str(out)} | model.summary).rstrip())
     else:

@@ -7,8 +7,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from twin_core.wording import counted
+
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from twin_core.network.spec import TwinSpec
 
 Progress = Callable[[float, str], None]
 
@@ -62,6 +66,18 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
 def print_line(text: str) -> None:
     """Print one line of a result."""
     print(text, flush=True)
+
+
+def sizes(spec: "TwinSpec") -> str:
+    """Return how much of everything a specification declares."""
+    hidden = sum(1 for node in spec.nodes if not node.sensors)
+    declared = (
+        f"{counted(len(spec.nodes), 'node')} ({hidden} without a sensor)",
+        counted(len(spec.conductors) + len(spec.radiators) + len(spec.radiation), "coupling"),
+        counted(len(spec.loads), "load"),
+        counted(len(spec.used_channels), "telemetry channel"),
+    )
+    return ", ".join(declared)
 
 
 def to_json(data: Any) -> str:

@@ -63,6 +63,7 @@ def convert(
     from replay.cli.console import notify, print_line, to_json
     from replay.cli.play import _renames
     from replay.cli.recordings import check_suffix
+    from twin_core.wording import counted
 
     check_suffix(out)
     wish = Wish(kind, time_name, Stated(scale, epoch, time_unit), xtce, container)
@@ -80,7 +81,7 @@ def convert(
     outcome = {"out": str(out), "samples": len(whole), "channels": list(whole.columns), "units": dict(whole.units)}
     outcome |= {"notices": notices}
     named = ", ".join(f"{name} ({whole.units.get(name, 'unit not stated')})" for name in whole.columns)
-    print_line(to_json(outcome).rstrip() if as_json else f"{out}: {len(whole)} samples of {named}")
+    print_line(to_json(outcome).rstrip() if as_json else f"{out}: {counted(len(whole), 'sample')} of {named}")
 
 
 def _pairs(pairs: tuple[str, ...], flag: str, form: str) -> dict[str, str]:
@@ -125,6 +126,7 @@ def _fitted(recording: "Recording", spec: Path, renames: dict[str, str]) -> "tup
     from replay.mapping import apply_mapping, map_topics
     from replay.recording import Recording
     from twin_core.network.spec_io import load_spec
+    from twin_core.wording import counted
 
     channels = load_spec(spec).channels
     mapping = map_topics(list(recording.columns), list(channels), renames, ignore_others=True)
@@ -145,8 +147,9 @@ def _fitted(recording: "Recording", spec: Path, renames: dict[str, str]) -> "tup
         raise BridgeError("; ".join(faults))
     others = [topic for topic in recording.columns if topic not in mapping]
     lacking = [name for name in channels if name not in columns and not name.startswith("orbit.")]
-    told = [f"{len(others)} column(s) feed no channel and are left out: {', '.join(others[:8])}"] if others else []
-    told += [f"channel(s) without telemetry: {', '.join(lacking)}"] if lacking else []
+    unused = counted(len(others), "column feeds no channel and is", "columns feed no channel and are")
+    told = [f"{unused} left out: {', '.join(others[:8])}"] if others else []
+    told += [f"{counted(len(lacking), 'channel')} without telemetry: {', '.join(lacking)}"] if lacking else []
     return Recording(named.time_ns, columns, units), told
 
 

@@ -63,6 +63,7 @@ def export(model: Path, out: Path, as_fmu: bool, deck: Path | None, as_spec: boo
     from twin_core.interchange.esatan_patch import as_patch, patched
     from twin_core.network.model import build_network
     from twin_core.network.spec_io import load_spec
+    from twin_core.wording import counted
 
     try:
         text = deck.read_text(encoding="utf-8", errors="replace")
@@ -76,7 +77,7 @@ def export(model: Path, out: Path, as_fmu: bool, deck: Path | None, as_spec: boo
         )
     write_text(out, as_patch(text, after, deck.name))
     notify([f"{deck}: {name} stands in no statement of its own and is not in the patch" for name in left])
-    print_line(f"wrote {out}: {len(changed)} couplings changed")
+    print_line(f"wrote {out}: {counted(len(changed), 'coupling')} changed")
 
 
 def _plain(model: "CalibratedModel") -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from replay.cli.command import FILE, Command
-from replay.cli.durations import DURATION
+from replay.cli.durations import POSITIVE_DURATION
 from replay.cli.effects import effects_option
 
 if TYPE_CHECKING:
@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from twin_core.telemetry import Record
 
 _OUT = (".csv", ".json")
+_OPTIONS = {"horizon_s": "'--horizon'", "step_s": "'--step'"}
+"""The options behind the arguments of :func:`twin_core.forecast.forecast`."""
 
 
 @click.command(
@@ -26,9 +28,11 @@ _OUT = (".csv", ".json")
 @click.option(
     "--telemetry", required=True, multiple=True, metavar="FILE", type=FILE, help="CSV or MCAP file up to now."
 )
-@click.option("--horizon", required=True, type=DURATION, help="How far to look ahead: seconds, or 6h, 1d.")
+@click.option("--horizon", required=True, type=POSITIVE_DURATION, help="How far to look ahead: seconds, or 6h, 1d.")
 @click.option(
-    "--step", type=DURATION, help="Time between forecasts: seconds, or 10min.  [default: as the telemetry is sampled]"
+    "--step",
+    type=POSITIVE_DURATION,
+    help="Time between forecasts, at most the horizon: seconds, or 10min.  [default: as the telemetry is sampled]",
 )
 @click.option("--plan", type=FILE, help="Planned inputs, CSV or MCAP.")
 @click.option(
@@ -57,8 +61,9 @@ def forecast(
     from replay.cli.console import notify, print_line, to_json
     from replay.cli.models import load_model
     from replay.cli.recordings import check_suffix, load_segments
-    from twin_core.errors import TelemetryError
+    from twin_core.errors import ArgumentError, TelemetryError
     from twin_core.forecast import forecast as look_ahead
+    from twin_core.wording import counted
 
     check_suffix(out, _OUT)
     if len(telemetry) > 1:
@@ -68,14 +73,17 @@ def forecast(
     if step is None and record.time_s.size < 2:
         raise TelemetryError(f"{record.name}: holds one sample, which tells no sampling interval; give --step")
     planned = _load_plan(plan, record, model, horizon) if plan else None
-    result = look_ahead(model, record, horizon, step_s=step, plan=planned, inputs=inputs)
+    try:
+        result = look_ahead(model, record, horizon, step_s=step, plan=planned, inputs=inputs)
+    except ArgumentError as error:
+        raise click.BadParameter(error.reason, param_hint=_OPTIONS[error.argument]) from error
     document = _document(result, record, model)
     _write(out, document)
     notify([*record.notices, *(planned.notices if planned else ()), *result.notices])
     if as_json:
         print_line(to_json(document).rstrip())
     else:
-        print_line(f"{out}: {len(result.time_s)} instants of {len(result.sensors)} sensors")
+        print_line(f"{out}: {counted(len(result.time_s), 'instant')} of {counted(len(result.sensors), 'sensor')}")
 
 
 def _load_plan(path: Path, record: "Record", model: "CalibratedModel", horizon_s: float) -> "Record":
@@ -116,7 +124,7 @@ def _check_plan(plan: "Record", inputs: list[str], now_s: float, horizon_s: floa
         raise TelemetryError(
             f"{plan.name}: ends at {plan.present(last_s)}, before the forecast begins at {plan.present(now_s)}"
         )
-    if np.isfinite(horizon_s) and first_s > now_s + horizon_s:
+    if first_s > now_s + horizon_s:
         end = plan.present(now_s + horizon_s)
         raise TelemetryError(f"{plan.name}: begins at {plan.present(first_s)}, after the forecast ends at {end}")
 

@@ -84,9 +84,10 @@ def import_model(
     Whatever is not understood is one line that names the file and the line, and then nothing is written, but with
     --skip-unknown.
     """
-    from replay.cli.console import notify, print_line, to_json
+    from replay.cli.console import notify, print_line, sizes, to_json
     from twin_core.errors import SpecError
     from twin_core.network.spec_io import load_spec
+    from twin_core.wording import counted
 
     if out.suffix not in (".yaml", ".yml", ".json"):
         raise click.UsageError(f"--out {out} must end in .yaml or .json")
@@ -105,7 +106,8 @@ def import_model(
         raise SpecError(_without_nodes(kind, files))
     if refused and not skip_unknown:
         raise SpecError(
-            f"{refused[0]}; {len(refused)} thing(s) were not understood: leave them out with --skip-unknown", refused
+            f"{refused[0]}; {counted(len(refused), 'item was', 'items were')} not understood: --skip-unknown leaves them out",
+            refused,
         )
     spec = load_spec(found.data)
     _write(out, found)
@@ -117,8 +119,7 @@ def import_model(
         print_line(to_json({"twin": spec.twin, "nodes": len(spec.nodes), **told}).rstrip())
         return
     notify([*found.notes, *beside, *(f"left out: {line}" for line in refused)])
-    couplings = len(spec.conductors) + len(spec.radiators) + len(spec.radiation)
-    print_line(f"wrote {out}: {len(spec.nodes)} nodes, {couplings} couplings, {len(spec.loads)} loads")
+    print_line(f"wrote {out}: {sizes(spec)}")
 
 
 def _text(file: Path) -> str:

@@ -45,7 +45,15 @@ ANSWER_IS_NO, BAD_INPUT, INTERNAL, INTERRUPTED = 1, 2, 70, 130
 def twin(traceback: bool) -> None:
     """A digital twin of a spacecraft's temperatures that finds what its model lacks.
 
-    Exit codes: 0 done, 1 the job ran and the answer is no, 2 bad input.
+    \b
+    Exit codes:
+      0    done
+      1    the job ran and the answer is no: demo did not find the hidden
+           effect, check found faults, the model has no solution, or a
+           service refused samples
+      2    bad input: one line on stderr says what is wrong and what to do
+      70   a fault of the program: run twin --traceback, and report it
+      130  interrupted
     """
 
 

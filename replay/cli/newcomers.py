@@ -11,6 +11,7 @@ from replay.cli.command import FILE, Command
 if TYPE_CHECKING:
     from twin_core.calibrate import CalibratedModel
     from twin_core.network.spec import TwinSpec
+    from twin_core.telemetry import Record
 
 MOST_LEVELS = 6
 """An auxiliary column that takes no more values than this is a state."""
@@ -35,6 +36,7 @@ def init(telemetry: Path, out: Path, sink: str) -> None:
     from twin_core.errors import SpecError
     from twin_core.files import write_text
     from twin_core.network.spec_io import load_spec
+    from twin_core.wording import counted
 
     if out.exists():
         raise SpecError(f"{out}: exists already; name another file")
@@ -44,7 +46,9 @@ def init(telemetry: Path, out: Path, sink: str) -> None:
     head = f"# Drafted by twin init from {telemetry.name}: what is joined to what, and where heat goes in, is yours to say.\n"
     write_text(out, head + text)
     notify(remarks)
-    print_line(f"wrote {out}: {len(document['nodes'])} nodes; edit it, then: twin check {out} --telemetry {telemetry}")
+    print_line(
+        f"wrote {out}: {counted(len(document['nodes']), 'node')}; edit it, then: twin check {out} --telemetry {telemetry}"
+    )
 
 
 def _drafted(telemetry: Path, sink: str) -> tuple[dict[str, Any], list[str]]:
@@ -128,13 +132,14 @@ def _channel(name: str, column: Any) -> dict[str, Any]:
 def check(spec: Path, telemetry: tuple[Path, ...], as_json: bool) -> None:
     """Say everything that is wrong with a specification at once, one line each, and what is likely to be a mistake.
 
-    Exits with 0 where nothing is wrong, 1 where something is.
+    Exits with 0 where nothing is wrong, 1 where something is. Doubts, which are likely mistakes, are counted at the end.
     """
-    from replay.cli.console import print_line, to_json
-    from replay.cli.recordings import load_records
+    from replay.cli.console import print_line, sizes, to_json
+    from replay.cli.recordings import load_records, too_short
     from twin_core.errors import SpecError, TwinError
     from twin_core.network.doubts import isolated
     from twin_core.network.spec_io import load_spec, read_mapping
+    from twin_core.wording import counted
 
     read_mapping(spec)  # a file that is no mapping is bad input, not an answer
     problems: list[str] = []
@@ -146,31 +151,26 @@ def check(spec: Path, telemetry: tuple[Path, ...], as_json: bool) -> None:
         problems = list(error.problems or [str(error)])
     if known is not None:
         doubts = list(isolated(known))
+        records: list[Record] = []
         for path in telemetry:
             try:
-                doubts += [notice for record in load_records([path], known) for notice in record.notices]
+                records += load_records([path], known)
             except TwinError as error:
                 problems.append(str(error))
+        notices = [notice for record in records for notice in record.notices]
+        doubts = list(dict.fromkeys([*doubts, *notices, *too_short(records)]))
     if as_json:
         print_line(to_json({"valid": not problems, "problems": problems, "doubts": doubts}).rstrip())
     else:
         for line in problems:
             print_line(f"{spec}: {line}" if not line.startswith(str(spec)) else line)
-        for line in dict.fromkeys(doubts):
+        for line in doubts:
             print_line(f"likely a mistake: {line}")
         if known is not None and not problems:
-            print_line(_said(known))
+            state = f"{counted(len(doubts), 'doubt')}, listed above" if doubts else "in order"
+            print_line(f"{known.twin}: {state}; {sizes(known)}")
     if problems:
         raise click.exceptions.Exit(1)
-
-
-def _said(spec: "TwinSpec") -> str:
-    couplings = len(spec.conductors) + len(spec.radiators) + len(spec.radiation)
-    hidden = sum(1 for node in spec.nodes if not node.sensors)
-    return (
-        f"{spec.twin}: in order; {len(spec.nodes)} nodes ({hidden} without a sensor), {couplings} couplings, "
-        f"{len(spec.loads)} loads, {len(spec.used_channels)} telemetry channels"
-    )
 
 
 @click.command(cls=Command, short_help="Print what a model file says.", example="twin show model.json")
@@ -178,7 +178,7 @@ def _said(spec: "TwinSpec") -> str:
 @click.option("--json", "as_json", is_flag=True, help="Print the parameters and effects as JSON.")
 def show(model: Path, as_json: bool) -> None:
     """Print a calibrated model: what was added to it, and every parameter with its uncertainty."""
-    from replay.cli.console import print_line, print_table, short, to_json
+    from replay.cli.console import print_line, print_table, short, sizes, to_json
     from replay.cli.models import load_model
 
     found = load_model(model)
@@ -187,7 +187,7 @@ def show(model: Path, as_json: bool) -> None:
         effects = [str(effect.label) for effect in found.effects]
         print_line(to_json({"twin": found.spec.twin, "effects": effects, "parameters": rows}).rstrip())
         return
-    print_line(_said(found.spec).replace(": in order;", ":"))
+    print_line(f"{found.spec.twin}: {sizes(found.spec)}")
     for effect in found.effects:
         values = ", ".join(f"{name} = {short(value, 4)}" for name, value in effect.values.items())
         print_line(f"  added: {effect.label} ({values})")

@@ -27,6 +27,7 @@ from twin_core.telemetry_csv import (
     write_columns,
 )
 from twin_core.units import format_instant, from_si, to_si
+from twin_core.wording import counted
 
 if TYPE_CHECKING:
     from twin_core.fem.film import Film
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 DATED = "dated"
 """Metadata of an MCAP file: "false" where log times are seconds since an unknown start."""
 SUFFIXES = (".csv", ".mcap")
+LEAST_SAMPLES = 20
+"""So many samples a calibration should have, and a part of a record that is asked for must have."""
 _TEMPERATURE_UNITS = ("K", "degC")
 
 
@@ -77,7 +80,7 @@ def _segments_of(path: Path, spec: TwinSpec) -> list[Record]:
         return read_segments(path, spec)
     segments = [_from_recording(path, part, spec, None) for part in read_mcap_segments(path)]
     if len(segments) > 1:
-        said = f"{path}: the clock jumps back {len(segments) - 1} time(s); a new segment begins at each"
+        said = f"{path}: the clock jumps back {counted(len(segments) - 1, 'time')}; a new segment begins at each"
         segments[0] = replace(segments[0], notices=(*segments[0].notices, said))
     return segments
 
@@ -110,6 +113,18 @@ def load_records(paths: Sequence[Path], spec: TwinSpec, *, masking: bool = True)
     if records:
         _check_sampled(spec, records)
     return records
+
+
+def too_short(records: Sequence[Record]) -> list[str]:
+    """Return a notice of records that have too few samples to determine parameters."""
+    count = sum(record.time_s.size for record in records)
+    if not records or count >= LEAST_SAMPLES:
+        return []
+    names = ", ".join(dict.fromkeys(record.name for record in records))
+    return [
+        f"{names}: {counted(count, 'sample')} in all, too few to determine parameters reliably; give at least "
+        f"{LEAST_SAMPLES} samples, better those of an orbit or of several time constants"
+    ]
 
 
 def _check_sampled(spec: TwinSpec, records: Sequence[Record]) -> None:

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import click
 import numpy as np
 
+from replay.cli.recordings import LEAST_SAMPLES
 from twin_core.calibrate.approach import thinned
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 from twin_core.units import calendar_instant
-
-LEAST_SAMPLES = 20
+from twin_core.wording import counted
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def selected(spec: TwinSpec, records: Sequence[Record], wanted: Wanted) -> list[
     count = sum(record.time_s.size for record in inside)
     if count < LEAST_SAMPLES:
         raise TelemetryError(
-            f"{records[0].name}: the telemetry holds {count} samples there, {LEAST_SAMPLES} are needed"
+            f"{records[0].name}: {counted(count, 'sample')} in the selected part, {LEAST_SAMPLES} are needed; select more"
         )
     most = count if wanted.samples is None else wanted.samples
     if count <= most:

@@ -27,6 +27,7 @@ def simulate(scenario: Path, out: Path, field_every: float | None, as_json: bool
     from twin_core.fem.scenario import load_scenario
     from twin_core.fem.simulate import no_watch
     from twin_core.fem.simulate import simulate as run
+    from twin_core.wording import counted
 
     check_suffix(out)
     if field_every is not None and out.suffix != ".mcap":
@@ -42,5 +43,5 @@ def simulate(scenario: Path, out: Path, field_every: float | None, as_json: bool
     print_line(
         to_json(outcome).rstrip()
         if as_json
-        else f"{out}: {record.time_s.size} samples of {len(record.values)} channels"
+        else f"{out}: {counted(record.time_s.size, 'sample')} of {counted(len(record.values), 'channel')}"
     )

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
+from replay.bridges.convert import Wish, read
 from replay.bridges.errors import BridgeError
 from replay.bridges.time_scales import STEPS_NS, TAI_LESS_UTC_NS, Stated, from_numbers, from_texts
 from replay.cli.main import main
@@ -68,7 +69,7 @@ def test_a_leap_second_counts_as_the_second_after_it() -> None:
     texts = ["2016-12-31T23:59:59.5Z", "2016-12-31T23:59:60.5Z", "2017-01-01T00:00:00.5Z"]
     found = from_texts(texts, Stated(), "x")
     assert np.diff(found.unix_ns).tolist() == [1_000_000_000, 0]
-    assert found.notices == ("x: 1 time(s) within a leap second count as the second after it",)
+    assert found.notices == ("x: 1 time within a leap second counts as the second after it",)
     tai = ["2017-01-01T00:00:35.5", "2017-01-01T00:00:36.5", "2017-01-01T00:00:37.5"]
     assert from_texts(tai, Stated("tai"), "x").unix_ns.tolist() == found.unix_ns.tolist()
     with pytest.raises(BridgeError, match="there was no leap second"):
@@ -135,6 +136,20 @@ def rows(path: Path) -> list[dict[str, str]]:
 def spec(tmp_path: Path) -> str:
     (tmp_path / "sat.yaml").write_text(yaml.safe_dump(SPEC))
     return str(tmp_path / "sat.yaml")
+
+
+@pytest.mark.parametrize(
+    ("cells", "said"),
+    [
+        (["20", "inf"], "1 cell is not a number ('inf')"),
+        (["20", "inf", "-inf", "n/a"], "3 cells are not numbers ('inf', 'n/a')"),
+    ],
+)
+def test_cells_without_a_number_are_counted(tmp_path: Path, cells: list[str], said: str) -> None:
+    source = tmp_path / "export.csv"
+    times = (f"2026-03-01T00:00:0{k}.000Z" for k in range(len(cells)))
+    source.write_text("Time\tT_a\n" + "".join(f"{t}\t{cell}\n" for t, cell in zip(times, cells, strict=True)))
+    assert f"column 'T_a': {said}; left out" in " ".join(read(source, Wish()).notices)
 
 
 def test_an_export_of_yamcs_becomes_telemetry(tmp_path: Path, spec: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -262,14 +277,14 @@ def test_packets_become_telemetry_through_xtce(tmp_path: Path, spec: str, capsys
     command += ["--time", "GPS_S"]
     assert main(command) == 2 and "what they count from" in capsys.readouterr().err
     assert main([*command, "--epoch", "gps"]) == 0
-    assert "1 packet(s) that the XTCE does not describe" in capsys.readouterr().err
+    assert "1 packet that the XTCE does not describe" in capsys.readouterr().err
     found = rows(out)
     assert [row["time"] for row in found] == [f"2026-03-01T00:00:{10 * k:02d}.000000Z" for k in range(3)]
     assert [float(row["T_a"]) for row in found] == pytest.approx([293.15 + 0.01 * k for k in range(3)])
     assert [float(row["Q_a"]) for row in found] == [1.5] * 3
     (tmp_path / "cut.bin").write_bytes(b"".join(frames)[:-3])
     assert main(["convert", str(tmp_path / "cut.bin"), *command[2:], "--epoch", "gps"]) == 0
-    assert "the last 13 byte(s) are no whole packet" in capsys.readouterr().err and len(rows(out)) == 2
+    assert "13 bytes at the end: not a whole packet" in capsys.readouterr().err and len(rows(out)) == 2
     (tmp_path / "text.bin").write_text("hello world, this is text")
     assert main(["convert", str(tmp_path / "text.bin"), *command[2:], "--epoch", "gps"]) == 2
     assert "no sequence of whole CCSDS packets" in capsys.readouterr().err
@@ -319,7 +334,7 @@ def test_decoded_frames_become_telemetry(tmp_path: Path, spec: str, capsys: pyte
         "Q_a=W",
     ]
     assert main(command) == 0
-    assert "1 frame(s) are not decoded" in capsys.readouterr().err
+    assert "1 frame is not decoded" in capsys.readouterr().err
     assert [row["T_a"] for row in rows(tmp_path / "t.csv")] == ["293.15", "294.15"]
 
 

@@ -133,6 +133,6 @@ def test_repeated_instants_are_counted(tmp_path: Path) -> None:
     recording = read_mcap(_written(tmp_path / "a.mcap", [(5, 5.0), (5, 5.0), (5, 7.0), (6, 6.0)]))
     np.testing.assert_array_equal(recording.columns["T"], [5.0, 6.0])
     assert [notice.split(";")[0] for notice in recording.notices] == [
-        "1 sample(s) repeat the instant and the value of an earlier one",
-        "1 sample(s) repeat the instant of an earlier one with another value",
+        "1 sample repeats the instant and the value of an earlier one",
+        "1 sample repeats the instant of an earlier one with another value",
     ]

@@ -1,5 +1,6 @@
 """Forecasts against closed forms, their plans, and the coverage of their bands on spacecraft that SciPy simulated."""
 
+import pickle
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,7 +15,7 @@ from twin_core.assimilate import FLOOR_SHARE, assimilate
 from twin_core.calibrate import calibrate
 from twin_core.calibrate.result import CalibratedModel
 from twin_core.effects.learned_heat_flow import LearnedHeatFlow
-from twin_core.errors import ModelError, TelemetryError
+from twin_core.errors import ArgumentError, ModelError, TelemetryError
 from twin_core.forecast import forecast
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
@@ -191,8 +192,10 @@ def test_the_state_is_filtered_from_the_record() -> None:
 def test_impossible_requests_are_named(
     horizon_s: float, step_s: float | None, quantiles: Sequence[float], message: str
 ) -> None:
-    with pytest.raises(ModelError, match=message):
+    with pytest.raises(ArgumentError, match=message) as caught:
         forecast(integrator(), now(), horizon_s, step_s=step_s, quantiles=quantiles, state=known_start())
+    again = pickle.loads(pickle.dumps(caught.value))  # as from a worker process
+    assert str(again) == str(caught.value) == f"{again.argument}: {again.reason}"
 
 
 def test_an_input_that_was_never_seen_is_named() -> None:

@@ -79,6 +79,13 @@ def test_too_few_samples_are_refused(n_times: int, fraction: float) -> None:
         split_fraction([steady(n_times)], fraction)
 
 
+def test_single_samples_in_files_of_their_own_are_refused() -> None:
+    with pytest.raises(
+        TelemetryError, match=r"cannot be split by a hold-out of 0\.3; choose a larger one, or put single"
+    ):
+        split_fraction([steady(1, 60.0 * k, str(k)) for k in range(13)], 0.3)
+
+
 def test_a_burn_in_of_some_seconds() -> None:
     held = split_burn_in(steady(101), 600.0)
     assert held.lead.time_s[-1] == held.scored.time_s[0] == 600.0
@@ -98,7 +105,9 @@ def test_no_burn_in_starts_from_the_first_sample() -> None:
 
 @pytest.mark.parametrize("burn_in_s", [20 * 60.0, 18.5 * 60.0, 1e9])
 def test_a_burn_in_that_leaves_nothing_is_refused(burn_in_s: float) -> None:
-    with pytest.raises(TelemetryError, match="record: nothing is left to score after a burn-in"):
+    with pytest.raises(
+        TelemetryError, match=r"record: a burn-in of \d+ of its 20 samples leaves fewer than two to score"
+    ):
         split_burn_in(steady(20), burn_in_s)
 
 

@@ -120,8 +120,8 @@ def test_repeated_instants_are_dropped_and_counted(tmp_path: Path, spec: TwinSpe
     record = read_csv(written(tmp_path, f"time_s,T_a,T_b,Q_a\n{rows}"), spec)
     np.testing.assert_array_equal(record.time_s, [0.0, 5.0, 9.0])
     np.testing.assert_allclose(record.values["T_a"], [293.15, 294.15, 296.15])
-    assert "1 row(s) repeat the instant and the values" in record.notices[0]
-    assert "2 row(s) repeat the instant of the row before with other values; the first stays" in record.notices[1]
+    assert "1 row repeats the instant and the values" in record.notices[0]
+    assert "2 rows repeat the instant of the row before with other values; the first stays" in record.notices[1]
 
 
 def test_a_clock_that_jumps_back_begins_a_segment(tmp_path: Path, spec: TwinSpec) -> None:
@@ -132,7 +132,10 @@ def test_a_clock_that_jumps_back_begins_a_segment(tmp_path: Path, spec: TwinSpec
     np.testing.assert_array_equal(first.time_s, np.arange(30.0))
     np.testing.assert_array_equal(second.time_s, np.arange(5.0, 45.0))
     assert second.values["T_a"][0] == pytest.approx(293.15 + 3.5)
-    assert "jumps back 2 time(s), first in row 32" in first.notices[0] and "5 row(s) between jumps" in first.notices[0]
+    assert (
+        "jumps back 2 times, first in row 32" in first.notices[0]
+        and "5 rows between jumps are left out" in first.notices[0]
+    )
     assert second.notices == ()
     with pytest.raises(TelemetryError, match="its clock jumps back to 5"):
         read_csv(path, spec)

@@ -53,7 +53,7 @@ def check_time() -> None:
     """
     cpu_limit = _cpu_limit.get()
     if is_late(_limit.get()) or (cpu_limit < NO_DEADLINE and time.thread_time() >= cpu_limit):
-        raise TimeIsUpError("the time is up")
+        raise TimeIsUpError("the deadline was reached")
 
 
 def is_late(deadline: float) -> bool:

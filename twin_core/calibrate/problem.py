@@ -87,7 +87,7 @@ def build_segment(network: Network, record: Record, max_step_s: float) -> Segmen
     measured = measured_temperatures(network.spec, record)
     if record.time_s.size < 3 or int(np.isfinite(measured).sum()) < 3:
         sensors = ", ".join(network.spec.sensors)
-        raise TelemetryError(f"{record.name}: fewer than three usable samples of {sensors}; nothing can be fitted")
+        raise TelemetryError(f"{record.name}: fewer than three usable samples of {sensors}; give a longer record")
     mean, std = _start_prior(network, record, measured)
     return Segment(record, build_forcing(network, record, max_step_s), measured, mean, std)
 

@@ -111,9 +111,9 @@ def prepare(
     readings = sum(int(segment.valid.sum()) for segment in problem.segments)
     if readings < READINGS_PER_UNKNOWN * problem.n_unknowns:
         raise TelemetryError(
-            f"{records[0].name}: {readings} readings cannot tell {problem.n_unknowns} unknowns (parameters and initial"
-            f" temperatures) and their uncertainty; give at least {READINGS_PER_UNKNOWN * problem.n_unknowns} readings, or"
-            " values that are known"
+            f"{records[0].name}: {readings} readings are too few to determine {problem.n_unknowns} unknowns (parameters and"
+            f" initial temperatures) with their uncertainty; give at least {READINGS_PER_UNKNOWN * problem.n_unknowns} readings,"
+            " or declare known values in the specification"
         )
     problem = problem.with_network(network.with_parameters(balance_start(problem)))
     for _ in range(MAX_HALVINGS):

@@ -157,8 +157,12 @@ class Looked:
         if self.complete:
             return ""
         if self.tried < self.possible:
-            return f"of {self.possible:,} possible mistakes of the declaration {self.tried:,} were looked at, not the others"
-        return "not every mistake that might explain the fit was looked at closely"
+            return (
+                f"checked {self.tried:,} of {self.possible:,} possible single mistakes in the specification (units, signs, "
+                "swapped sensors, misplaced loads, known values, missing couplings); the computing time did not allow for "
+                f"the other {self.possible - self.tried:,}, one of which may be the cause"
+            )
+        return "checked all possible single mistakes in the specification, but not all of the likeliest of them closely"
 
 
 def declared_of(problem: Problem) -> Declared:

@@ -8,7 +8,7 @@ import numpy as np
 from twin_core._typing import FloatArray, Json
 from twin_core.assimilate import assimilate
 from twin_core.calibrate.result import CalibratedModel
-from twin_core.errors import ModelError
+from twin_core.errors import ArgumentError, ModelError
 from twin_core.forecast.assumed import How, Inputs, assume, future_record, own_times_s
 from twin_core.forecast.bands import mixture_quantiles, whole_path_factor
 from twin_core.forecast.past import Missed, deviations_K, missed
@@ -103,8 +103,10 @@ def forecast(
 
     Raises
     ------
+    ArgumentError
+        If horizon, step or a quantile is out of range.
     ModelError
-        If horizon, step, inputs or a quantile is out of range, or the balance has no solution.
+        If the inputs are none that there are, or the balance has no solution.
     """
     step = _sampling_s(record) if step_s is None else step_s
     _check(horizon_s, step, quantiles, model.max_step_s)
@@ -178,9 +180,9 @@ def _short(found: Missed, horizon_s: float) -> tuple[str, ...]:
 
 
 def _sampling_s(record: Record) -> float:
-    """Return the record's median sampling interval; ModelError if it has a single sample."""
+    """Return the record's median sampling interval; ArgumentError if it has a single sample."""
     if record.time_s.size < 2:
-        raise ModelError("step_s: give one; the telemetry has a single sample and no sampling interval")
+        raise ArgumentError("step_s", "give one; the telemetry has a single sample and no sampling interval")
     return float(np.median(np.diff(record.time_s)))
 
 
@@ -195,16 +197,19 @@ def _present(model: CalibratedModel, record: Record, state: Json | None) -> tupl
 
 def _check(horizon_s: float, step_s: float, quantiles: Sequence[float], max_step_s: float) -> None:
     if not (np.isfinite(horizon_s) and horizon_s > 0):
-        raise ModelError(f"horizon_s: must be a positive number of seconds (got {horizon_s})")
+        raise ArgumentError("horizon_s", f"must be a positive number of seconds (got {horizon_s})")
     if not (np.isfinite(step_s) and 0 < step_s <= horizon_s):
-        raise ModelError(f"step_s: must be positive and at most the horizon (got {step_s})")
+        it_is = f"it is {step_s:g} s (default: the sampling interval)"
+        raise ArgumentError("step_s", f"must be positive and at most the horizon of {horizon_s:g} s; {it_is}")
     if horizon_s / step_s > MAX_POINTS:
-        raise ModelError(f"step_s: {horizon_s / step_s:.0f} points asked for, {MAX_POINTS} at most; take a longer step")
+        asked = f"{horizon_s / step_s:.0f} points asked for, {MAX_POINTS} at most"
+        raise ArgumentError("step_s", f"{asked}; give a longer step or a shorter horizon")
     if horizon_s / max_step_s > MOST_STEPS:
-        raise ModelError(
-            f"horizon_s: {horizon_s:.4g} s are {horizon_s / max_step_s:.3g} steps of at most {max_step_s:.3g} s, as this network "
-            f"needs them; ask for {MOST_STEPS * max_step_s:.3g} s or less"
+        raise ArgumentError(
+            "horizon_s",
+            f"{horizon_s:.4g} s are {horizon_s / max_step_s:.3g} steps of at most {max_step_s:.3g} s, as this network "
+            f"needs them; ask for {MOST_STEPS * max_step_s:.3g} s or less",
         )
     wrong = [q for q in quantiles if not 0.0 < q < 1.0]
     if wrong:
-        raise ModelError(f"quantiles: must lie between 0 and 1, exclusive (got {wrong[0]})")
+        raise ArgumentError("quantiles", f"must lie between 0 and 1, exclusive (got {wrong[0]})")

@@ -17,6 +17,7 @@ from twin_core.errors import SpecError
 from twin_core.interchange.imported import Course, Imported, name_of, twin_id
 from twin_core.interchange.network import Deck, kelvin, specified
 from twin_core.network.formula import channels_of, evaluate
+from twin_core.wording import counted
 
 _SECTION = re.compile(r"^\s*\$(\w+)\s*(.*)$")
 _NODE = re.compile(r"^([DBX])\s*(\d+)\s*=\s*'([^']*)'\s*(?:,(.*))?$", re.IGNORECASE | re.DOTALL)
@@ -294,8 +295,9 @@ def read_esatan(text: str, source: str, *, channels: Mapping[str, str] | None = 
     if silent:
         deck.notes.append(f"{source}: {', '.join(sorted(silent))} say how to solve and print, and are not read")
     if reader.inactive:
+        couplings = counted(reader.inactive_couplings, "coupling")
         deck.notes.append(
-            f"{source}: {len(reader.inactive)} inactive node(s) and {reader.inactive_couplings} coupling(s) to them are left out"
+            f"{source}: left out: {counted(len(reader.inactive), 'inactive node')}, and {couplings} to inactive nodes"
         )
     return specified(deck, {name_of(n): c for n, c in (channels or {}).items()}, held=held, source=source)
 

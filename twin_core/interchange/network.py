@@ -7,6 +7,7 @@ from twin_core._typing import Json
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.errors import SpecError
 from twin_core.interchange.imported import Course, Imported, number
+from twin_core.wording import counted
 
 SMALLEST = 1e-12
 """A coupling that is smaller carries nothing; the specification knows none."""
@@ -160,15 +161,17 @@ def _told(deck: Deck, unread: bool, driven: Sequence[str], source: str) -> list[
     if unread:
         notes.append(f"{source}: every node got a channel 'T_<node>'; name those that telemetry reads with --channel")
     if deck.parallel:
-        notes.append(f"{source}: {deck.parallel} couplings lie parallel to others and were added to them")
+        lie = counted(deck.parallel, "coupling is parallel to another", "couplings are parallel to others")
+        notes.append(f"{source}: {lie}; parallel ones were added up")
     dropped = [f"{a} - {b}" for c in (deck.linear, deck.radiative) for (a, b), v in c.items() if 0.0 <= v < SMALLEST]
     if dropped:
-        notes.append(f"{source}: {len(dropped)} couplings are below {SMALLEST:g} and left out ({dropped[0]}, ...)")
+        small = counted(len(dropped), "coupling is", "couplings are")
+        more = ", ..." if len(dropped) > 1 else ""
+        notes.append(f"{source}: {small} below {SMALLEST:g} and left out ({dropped[0]}{more})")
     if driven:
-        notes.append(
-            f"{source}: {len(driven)} heat(s) go over time and became channels that telemetry must carry "
-            f"({driven[0]}, ...)"
-        )
+        vary = counted(len(driven), "heat varies", "heats vary")
+        more = ", ..." if len(driven) > 1 else ""
+        notes.append(f"{source}: {vary} over time: channels that telemetry must carry ({driven[0]}{more})")
     return notes
 
 

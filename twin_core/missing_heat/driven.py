@@ -18,7 +18,7 @@ from twin_core.discover.judge import Search
 from twin_core.effects.base import Effect
 from twin_core.effects.heat import effect_heat_W
 from twin_core.errors import TwinError
-from twin_core.missing_heat.smoothed import smoothed_force
+from twin_core.missing_heat.smoothed import not_in_report, smoothed_force
 from twin_core.network.dynamics import fill_boundaries
 from twin_core.network.model import Layout
 from twin_core.network.terms import Along
@@ -53,7 +53,7 @@ def driven_heat(search: Search, *, deadline: float = NO_DEADLINE) -> tuple[list[
             check_time()
             force, _, _, _, view = smoothed_force(fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
-        return [], [f"heat of the couplings that were found: the latent force could not be smoothed ({error})"]
+        return [], [not_in_report("the heat of the couplings that were found", error)]
     network = fit.network
     states = force.temperature_K[1:]
     n_steps = states.shape[0]

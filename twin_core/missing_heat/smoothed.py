@@ -191,6 +191,15 @@ class MissingHeat:
         return [heat.words(no_heat=self.no_heat) for heat in self.heats if heat.mean_W.any()]
 
 
+def not_in_report(what: str, error: Exception) -> str:
+    """Return the notice that a part of the report could not be computed, and why."""
+    if isinstance(error, TimeIsUpError):
+        why = "the deadline was reached before it was computed; allow more time"
+    else:
+        why = f"its computation failed ({str(error) or type(error).__name__})"
+    return f"the report does not contain {what}: {why}"
+
+
 def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> MissingHeat:
     """Smooth the missing heat at the nodes of interest of the declared model, over the last training segment.
 
@@ -210,9 +219,7 @@ def smooth_missing_heat(search: Search, *, deadline: float = NO_DEADLINE) -> Mis
             fit = _as_told(search.base)
             force, model, observations, values, view = smoothed_force(fit, nodes)
     except (TwinError, ArithmeticError, np.linalg.LinAlgError, TimeIsUpError) as error:
-        return MissingHeat(
-            (), (f"missing heat at {', '.join(nodes)}: the latent force could not be smoothed ({error})",)
-        )
+        return MissingHeat((), (not_in_report(f"the missing heat at {', '.join(nodes)}", error),))
     network = fit.network
     watched = [force.nodes.index(network.nodes.index(node)) for node in nodes]
     laws, notices = ({}, []) if is_late(deadline) else _laws(model, observations, values, force, watched)

@@ -13,6 +13,7 @@ import numpy as np
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.quality.runs import runs_of
 from twin_core.telemetry import LEAST_PART, Record, cut_at_gaps
+from twin_core.wording import counted
 
 SHORTEST_GAP = 10.0
 """Usual intervals up to which a held value bridges what is missing, whatever it is: a few lost rows end no record."""
@@ -161,17 +162,18 @@ def _lapse_notices(record: Record, lapses: Sequence[_Lapse], cut: Sequence[_Laps
         if rows == 0:
             continue
         if lapse in cut:
-            fate = "changes faster than that: {} row(s) left out; a new segment begins with its next sample"
+            fate = "changes faster than that: {} left out; a new segment begins with its next sample"
         elif lapse.known:
-            fate = "changes more slowly than that: {} row(s) are given the values beside them"
+            fate = "changes more slowly than that: {} given the values beside them"
         else:
-            fate = "changes faster than that, yet {} row(s) are given the values beside them; add its samples, or leave them out"
+            fate = "changes faster than that, yet {} given the values beside them; add its samples, or leave them out"
         told.setdefault((lapse.channel, fate), []).append((lapse, rows))
     for (channel, fate), same in told.items():
         begin, end = record.present(same[0][0].begin_s), record.present(same[0][0].end_s)
-        again = f" (and {len(same) - 1} more such time(s))" if len(same) > 1 else ""
+        again = f" (and {counted(len(same) - 1, 'more such time')})" if len(same) > 1 else ""
         rows = sum(count for _, count in same)
-        yield f"{record.name}: channel '{channel}' has no samples from {begin} to {end}{again}, and {fate.format(rows)}"
+        said = fate.format(counted(rows, "row is", "rows are"))
+        yield f"{record.name}: channel '{channel}' has no samples from {begin} to {end}{again}, and {said}"
 
 
 def _cut(record: Record, inputs: Sequence[str]) -> list[Record]:

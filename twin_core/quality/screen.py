@@ -12,6 +12,7 @@ from twin_core.quality.runs import runs_of
 from twin_core.quality.sentinels import sentinels
 from twin_core.quality.spikes import spikes
 from twin_core.telemetry import Flaw, Record
+from twin_core.wording import counted
 
 FROZEN, HELD, RAIL, SENTINEL, SPIKE = "frozen", "held", "rail", "sentinel", "spike"
 TEMPERATURE_UNITS = ("K", "degC")
@@ -164,7 +165,7 @@ def _notices(record: Record, screening: Screening) -> Iterator[str]:
         names = ", ".join(f"'{channel}'" for channel in channels)
         each = "" if len(channels) == 1 else "each of "
         yield (
-            f"{record.name}: {samples} reading(s) of {each}{names} left out as {_WORDS[reason]},"
+            f"{record.name}: {counted(samples, 'reading')} of {each}{names} left out as {_WORDS[reason]},"
             f" the first at {record.present(record.time_s[first])}"
         )
 

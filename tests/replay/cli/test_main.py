@@ -1,7 +1,9 @@
 """The entry point: help, exit codes, and what an import of the command line drags in."""
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
@@ -57,6 +59,16 @@ def test_help(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == 0
     printed = capsys.readouterr().out
     assert all(command in printed for command in COMMANDS)
+
+
+def test_help_tells_every_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    """Those that the documentation lists, and no others."""
+    page = (Path(__file__).parents[3] / "docs" / "cli.md").read_text()
+    assert main(["--help"]) == 0
+    told = re.findall(r"^ {4}(\d+)  +\S", capsys.readouterr().out, re.MULTILINE)
+    assert told == re.findall(r"^\| (\d+) \|", page, re.MULTILINE)
+    codes = (module.ANSWER_IS_NO, module.BAD_INPUT, module.INTERNAL, module.INTERRUPTED)
+    assert told == ["0", *map(str, codes)]
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,11 +4,14 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 import pytest
+import yaml
 
 from replay.cli.durations import DURATION
 from replay.cli.main import main
@@ -45,7 +48,7 @@ def test_a_draft_is_a_specification_that_fits(flight: Path, tmp_path: Path, caps
     assert [node.id for node in spec.nodes] == ["box", "panel"]
     assert "'7th' has no valid name" in capsys.readouterr().err
     assert main(["check", str(out), "--telemetry", str(flight)]) == 0
-    assert "in order; 2 nodes" in capsys.readouterr().out
+    assert "1 doubt, listed above; 2 nodes" in capsys.readouterr().out
     assert main(["init", str(flight), "--out", str(out)]) == 2, "an existing file stays"
 
 
@@ -78,6 +81,35 @@ def test_all_faults_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert main(["check", str(path), "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["valid"] is False
     assert main(["check", str(tmp_path / "none.yaml")]) == 2
+
+
+def test_doubts_are_counted_instead_of_in_order(
+    tmp_path: Path,
+    pair_declared: dict[str, Any],
+    pair_telemetry: Callable[[int], str],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A record of ten rows is too short, and a column that nobody declares is ignored."""
+    path, data, model = tmp_path / "spec.yaml", tmp_path / "data.csv", tmp_path / "model.json"
+    path.write_text(yaml.safe_dump(pair_declared))
+    argv = ["check", str(path), "--telemetry", str(data)]
+    sizes = "2 nodes (0 without a sensor), 2 couplings, 1 load, 3 telemetry channels"
+    for text, state in (
+        (pair_telemetry(20), "in order"),
+        (pair_telemetry(10), "1 doubt, listed above"),
+        (pair_telemetry(10).replace("\n", ",7\n").replace("Q_a,7", "Q_a,P"), "2 doubts, listed above"),
+    ):
+        data.write_text(text)
+        assert main(argv) == 0
+        *doubts, last = capsys.readouterr().out.splitlines()
+        assert last == f"{pair_declared['twin']}: {state}; {sizes}"
+        assert len(doubts) == (0 if state == "in order" else int(state[0]))
+        assert all(doubt.startswith(f"likely a mistake: {data}: ") for doubt in doubts)
+    assert f"{data}: 10 samples in all, too few to determine parameters" in doubts[-1]
+    assert main([*argv, "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["doubts"]) == 2
+    assert main(["calibrate", "--spec", str(path), "--telemetry", str(data), "--out", str(model)]) == 0
+    assert f"note: {data}: 10 samples in all, too few" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

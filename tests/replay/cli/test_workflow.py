@@ -159,7 +159,7 @@ def test_without_masking_every_sample_counts(
     data.write_text(spoilt(pair_telemetry(600)).replace(",0,", ",271.5,"))
     arguments = ("calibrate", "--spec", desk / "spec.yaml", "--telemetry", data, "--out", model)
     clean, raw = run(capsys, *arguments), run(capsys, *arguments, "--no-masking")
-    assert any("2 reading(s) of 'T_a' left out as spikes" in notice for notice in clean["notices"])
+    assert any("2 readings of 'T_a' left out as spikes" in notice for notice in clean["notices"])
     assert (
         raw["notices"] == [] and raw["per_sensor"]["T_a"]["rmse_K"] > 2.0 > 0.1 > clean["per_sensor"]["T_a"]["rmse_K"]
     )

@@ -85,6 +85,8 @@ def test_long_records_are_approached_on_thin_ones() -> None:
 @pytest.mark.parametrize("n_times", [5, 3, 2, 1])
 def test_too_few_readings_for_the_unknowns_are_refused(n_times: int) -> None:
     """Four parameters and two initial temperatures need six samples of two sensors."""
-    with pytest.raises(TelemetryError, match=r"readings cannot tell 6 unknowns|fewer than three usable samples"):
+    with pytest.raises(
+        TelemetryError, match=r"readings are too few to determine 6 unknowns|fewer than three usable samples"
+    ):
         calibrate(load_spec(declared()), [telemetry(n_times)])
     assert np.isfinite(calibrate(load_spec(declared()), [telemetry(6)]).values["C:a"])

@@ -35,7 +35,9 @@ def test_a_dropout_changes_nothing_and_is_said(at: list[int], value: float, coun
     for name in TRUTH:
         assert with_garbage.values[name] == pytest.approx(left_out.values[name], rel=1e-9)
     (said,) = with_garbage.summary["notices"]
-    assert f"{count} reading(s) of 'T_a'" in said and f"first at {at[0] * STEP_S:g}" in said
+    assert (
+        f"{count} {'reading' if count == 1 else 'readings'} of 'T_a'" in said and f"first at {at[0] * STEP_S:g}" in said
+    )
     assert left_out.summary["notices"] == []
 
 

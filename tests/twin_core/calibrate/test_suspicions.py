@@ -226,7 +226,11 @@ def test_what_suspicions_cost_does_not_follow_the_network(n: int, monkeypatch: p
     # Units of the clock, swaps, couplings that are missing, joints that are held.
     assert looked.possible == 3 + 2 * pairs - joints + joints // 2
     assert set(fits) == {"unit", "swapped sensors", "missing coupling", "held value"}
-    assert not looked.complete and f"{looked.possible:,}" in looked.left_out and " 12 " in looked.left_out
+    assert not looked.complete
+    assert looked.left_out.startswith(
+        f"checked 12 of {looked.possible:,} possible single mistakes in the specification ("
+    )
+    assert f"the computing time did not allow for the other {looked.possible - 12:,}, one of which" in looked.left_out
     assert close_words(ParameterSet(()), {}, 9.0, [], complete=False, left_out=looked.left_out)[-1] == looked.left_out
 
 

@@ -139,11 +139,11 @@ def test_a_closed_loop_states_it_of_both_models(monkeypatch: pytest.MonkeyPatch)
 def test_a_closed_loop_goes_without_where_it_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Trial, "discrepancy", Mock(side_effect=ArithmeticError("not today")))
     loop = close_loop(load_spec(spec()), [record(0.0)])
-    assert any("makes parameters wrong by: not today" in line for line in loop.report["failures"])
+    assert any("parameter errors caused by the coarse network: not today" in line for line in loop.report["failures"])
 
 
 def test_a_closed_loop_goes_without_where_time_is_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Trial, "discrepancy", Mock(side_effect=TimeIsUpError("the time is up")))
+    monkeypatch.setattr(Trial, "discrepancy", Mock(side_effect=TimeIsUpError("the deadline was reached")))
     loop = close_loop(load_spec(spec()), [record(0.0)])
     assert loop.report["verdict"] == "no_effect_supported"
-    assert any("makes parameters wrong by: the time is up" in line for line in loop.report["failures"])
+    assert any("caused by the coarse network: the deadline was reached" in line for line in loop.report["failures"])

@@ -88,7 +88,7 @@ def test_what_might_explain_heat_is_only_told() -> None:
     (part,) = without_lapses([record], {"Q", "charge"}, {"Q"})
     assert part.time_s.size == 400
     (notice,) = part.notices
-    assert "channel 'charge' has no samples from 8940.0 to 12600.0" in notice and "59 row(s)" in notice
+    assert "channel 'charge' has no samples from 8940.0 to 12600.0" in notice and "59 rows are" in notice
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_rows_that_are_left_out_for_another_channel_are_not_told_to_be_bridged(c
     first, second = without_lapses([record], {"Q", "charge"}, {"Q"})
     assert first.time_s.size + second.time_s.size == 341
     told = [notice for notice in first.notices if "channel 'charge'" in notice]
-    assert [f"yet {rows} row(s)" in notice for notice in told] == ([True] if rows else [])
+    assert [f"yet {rows} rows are" in notice for notice in told] == ([True] if rows else [])
     assert all("from 17940.0 to 20400.0, and" in notice for notice in told if rows == 39)  # the lapse that is left
 
 
@@ -149,7 +149,7 @@ def test_a_lapse_in_the_hold_out_is_told_and_not_scored() -> None:
     report = close_loop(spec, [train], holdout_records=[held]).report
     assert report["before"]["rmse_K"] < 0.03 and report["findings"] == []
     (notice,) = (notice for notice in report["notices"] if "channel 'Q' has no samples" in notice)
-    assert "69 row(s) left out" in notice
+    assert "69 rows are left out" in notice
 
 
 def test_what_is_wrong_with_the_channels_is_told_where_there_is_no_solution(monkeypatch: pytest.MonkeyPatch) -> None:

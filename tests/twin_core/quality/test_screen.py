@@ -171,7 +171,7 @@ def test_a_masked_record_says_so_and_is_left_alone_afterwards() -> None:
     clean = masked(record, UNITS)
     assert np.isnan(clean.values["T_a"][[300, 301, 600]]).all() and np.isnan(clean.values["T_a"]).sum() == 3
     (notice,) = clean.notices
-    assert "3 reading(s) of 'T_a'" in notice and "first at 18000" in notice
+    assert "3 readings of 'T_a'" in notice and "first at 18000" in notice
     (row,) = quality_json([clean])
     first = row.pop("first")
     assert row == {"channel": "T_a", "reason": "sentinel", "samples": 3, "spans": 2}
