@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("thermal_twin", "twin_core", "service", "replay")
 
 ROOMS = (
-    *("constants", "errors", "_typing", "units", "files", "csv_table", "side_by_side", "once"),
+    *("constants", "errors", "_typing", "progress", "units", "files", "csv_table", "side_by_side", "once"),
     *("parameters", "telemetry", "orbit", "quality"),
     *("network", "gp", "telemetry_csv", "fem"),
     "interchange",
