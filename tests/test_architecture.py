@@ -19,7 +19,7 @@ ROOMS = (
     *("effects", "simulate", "latent_force"),
     "calibrate",
     *("assimilate", "anomaly", "forecast", "flows", "fmu", "holdout"),
-    *("discover", "missing_heat", "report", "closed_loop", "family"),
+    *("discover", "missing_heat", "report", "compiled", "closed_loop", "family"),
 )
 """The rooms of twin_core from left to right: each may use only those before it."""
 

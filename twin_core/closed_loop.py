@@ -8,7 +8,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
-from twin_core.calibrate.compiled import deadline_after
 from twin_core.calibrate.containment import TimeIsUpError, attempted, limited
 from twin_core.calibrate.discrepancy import stated
 from twin_core.calibrate.explained import advised
@@ -18,6 +17,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.undeclared.model import HeatFit
+from twin_core.compiled import deadline_after
 from twin_core.discover import policy
 from twin_core.discover.judge import MISTAKE, NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
