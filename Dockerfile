@@ -30,7 +30,7 @@ ENV PATH=/opt/twin/bin:$PATH \
     TWIN_PORT=8000 \
     TWIN_DATABASE_URL=sqlite:////data/twin.sqlite3
 USER twin
-RUN python -m twin_core.calibrate.compiled
+RUN python -m twin_core.compiled
 WORKDIR /data
 VOLUME /data
 EXPOSE 8000

@@ -15,7 +15,7 @@ $(STAMP): pyproject.toml
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet torch==2.13.0
 	$(BIN)/pip install --quiet --editable ".[dev,neural]"
-	$(BIN)/python -m twin_core.calibrate.compiled
+	$(BIN)/python -m twin_core.compiled
 	touch $@
 
 $(BENCH): $(STAMP)

@@ -12,14 +12,14 @@ ROOT = Path(__file__).parent.parent
 PACKAGES = ("thermal_twin", "twin_core", "service", "replay")
 
 ROOMS = (
-    *("constants", "errors", "_typing", "units", "files", "csv_table", "side_by_side", "once", "wording"),
+    *("constants", "errors", "_typing", "progress", "units", "files", "csv_table", "side_by_side", "once", "wording"),
     *("parameters", "telemetry", "orbit", "quality"),
     *("network", "gp", "telemetry_csv", "fem"),
     "interchange",
     *("effects", "simulate", "latent_force"),
     "calibrate",
     *("assimilate", "anomaly", "forecast", "flows", "fmu", "holdout"),
-    *("discover", "missing_heat", "report", "closed_loop", "family"),
+    *("discover", "missing_heat", "report", "compiled", "closed_loop", "family"),
 )
 """The rooms of twin_core from left to right: each may use only those before it."""
 

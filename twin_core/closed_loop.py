@@ -3,13 +3,11 @@
 import time
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from twin_core._typing import Json, Progress, no_progress
-from twin_core.calibrate.compiled import deadline_after
 from twin_core.calibrate.containment import TimeIsUpError, attempted, limited
 from twin_core.calibrate.discrepancy import stated
 from twin_core.calibrate.explained import advised
@@ -19,6 +17,7 @@ from twin_core.calibrate.result import CalibratedModel
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.calibrate.summary import to_model
 from twin_core.calibrate.undeclared.model import HeatFit
+from twin_core.compiled import deadline_after
 from twin_core.discover import policy
 from twin_core.discover.judge import MISTAKE, NO_MODEL, Search
 from twin_core.discover.long_records import on_all_samples, searched
@@ -32,6 +31,7 @@ from twin_core.missing_heat.driven import driven_heat
 from twin_core.missing_heat.smoothed import added_to_report, smooth_missing_heat
 from twin_core.network.screened import all_screened, segments
 from twin_core.network.spec import TwinSpec
+from twin_core.progress import Part
 from twin_core.quality import quality_json, quality_strip
 from twin_core.report.build import build_report
 from twin_core.report.dossier import Moment, check_moments, provenance
@@ -116,7 +116,7 @@ def close_loop(
     if deadline_s is not None and not deadline_s > 0.0:
         raise TelemetryError(f"deadline_s: must be a positive number of seconds (got {deadline_s:g})")
     deadline = deadline_after(deadline_s)
-    begun = time.perf_counter()
+    begun, whole_loop = time.perf_counter(), Part(progress)
     # The search ends at the deadline; what only illustrates its findings has a little longer.
     latest = deadline if deadline_s is None else deadline + AFTERWARDS * deadline_s
     with threadpool_limits(1):  # compiled loops run side by side; threads within their small products only contend
@@ -124,7 +124,7 @@ def close_loop(
         holdout_records = all_screened(spec, holdout_records or ())
         train, held = _split(spec, records, holdout, holdout_records, burn_in_s)
         check_moments(train, moments)
-        fit, calibration = _calibrated(spec, train, deadline, lambda f, m: progress(0.35 * f, m))
+        fit, calibration = _calibrated(spec, train, deadline, whole_loop.part(0.0, 0.2))
         before = to_model(calibration, ())
         declared, lost = _predicted(before, held)
         whole = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
@@ -133,29 +133,32 @@ def close_loop(
         # Beside a sensor that is stuck whatever is found would be wrong: a steady reading amid moving ones needs some effect.
         if not resting(spec.sensors, train):
             tried_first = {effect.place for effect in first}
-            told = partial(_part_of, progress)
+            told = whole_loop.part(0.2, 0.8)
             found = search(base, false_alarm_rate=false_alarm_rate, deadline=deadline, first=tried_first, progress=told)
         found.every = every
+        progress(0.8, "looking for mistakes of the declaration")
         doubts = look_for_mistakes(found, deadline=latest)
         if doubts.outdo(found):
             found.give_up(MISTAKE)
-        progress(0.88, "predicting the hold-out")
+        progress(0.85, "predicting the hold-out")
         after, predicted = _corrected(whole, found, held) or (before, declared)
         is_corrected = after is not before
         if not found.findings and doubts.looked is None:  # given up since: the declared model is asked
             doubts = look_for_mistakes(found, deadline=latest)
         if lost is not None and not is_corrected:
             raise lost
+        progress(0.9, "writing the report")
         before = _stated(before, found, found.base, latest)
         after = _stated(after, found, found.trial, latest) if is_corrected else before
         predictions = (declared, predicted)
         report = build_report(found, before, after, held, predictions, verdict_of(found), moments)
-        progress(0.93, "drawing")
+        progress(0.95, "smoothing the missing heat")
         missing = smooth_missing_heat(found, deadline=latest)
         report |= added_to_report(missing, report)
         report |= told_mistakes(found, doubts, report)
         driven, notices = driven_heat(found, deadline=latest)
         report["notices"] += notices
+        progress(0.98, "drawing")
         plots = build_plots(found, before, after, held, predictions, report, missing, driven)
         report["quality"] = quality_json([*records, *holdout_records])
         plots["quality_strip"] = quality_strip([*records, *holdout_records])
@@ -163,11 +166,6 @@ def close_loop(
         report["elapsed_s"] = time.perf_counter() - begun
         progress(1.0, "done")
         return ClosedLoop(report, after, before, plots)
-
-
-def _part_of(progress: Progress, fraction: float, message: str) -> None:
-    """Tell the progress of the search as a part of the whole."""
-    progress(0.35 + 0.5 * fraction, message)
 
 
 def _calibrated(

@@ -80,7 +80,7 @@ def calibrate(
     from replay.cli.recordings import check_suffix, load_records, too_short
     from replay.cli.selection import Wanted, selected
     from twin_core.calibrate import calibrate as fit
-    from twin_core.calibrate.compiled import deadline_after
+    from twin_core.compiled import deadline_after
     from twin_core.files import write_text
     from twin_core.network.spec_io import load_spec
 

@@ -73,9 +73,9 @@ def correlate(
     from replay.cli.printing import as_pdf
     from replay.cli.recordings import load_records
     from replay.cli.signed import document
-    from twin_core.calibrate.compiled import deadline_after
     from twin_core.calibrate.phases import Phase
     from twin_core.calibrate.phases import correlate as run
+    from twin_core.compiled import deadline_after
     from twin_core.files import make_folder, write_text
     from twin_core.network.spec_io import load_spec
     from twin_core.report.dossier import limits, provenance, sensitivity

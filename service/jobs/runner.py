@@ -36,7 +36,10 @@ from twin_core.telemetry import GAP_STEPS
 
 log = logging.getLogger("service.jobs")
 
-REPORT_EVERY_S = 0.3
+REPORT_EVERY_S, REPORTS_AT_ONCE = 0.3, 50
+"""How often a job's progress is written in the long run, and how many times at once: after short phases a long one may follow,
+whose words must not be lost."""
+
 VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""
 HOLDOUT_SHARE = 0.3
@@ -335,14 +338,15 @@ class Jobs:
         return chosen
 
     def _reporter(self, held: Claim) -> Callable[[float, str], None]:
-        """Return a progress callback for worker threads that writes now and then."""
-        last_s = 0.0
+        """Return a progress callback for worker threads that writes now and then, and some times in a row (a token bucket)."""
+        last_s, left = time.monotonic(), float(REPORTS_AT_ONCE)
 
         def report(fraction: float, message: str) -> None:
-            nonlocal last_s
+            nonlocal last_s, left
             now_s = time.monotonic()
-            if now_s - last_s >= REPORT_EVERY_S or fraction >= 1.0:
-                last_s = now_s
+            last_s, left = now_s, min(left + (now_s - last_s) / REPORT_EVERY_S, REPORTS_AT_ONCE)
+            if left >= 1.0 or fraction >= 1.0:
+                left -= 1.0
                 change = (jobs.report, held, min(max(fraction, 0.0), 1.0), message)
                 self._hub.submit(held.twin, outcome.announce, held.twin, held.kind, held.job, *change)
 

@@ -47,7 +47,7 @@ class CoreWorkbench:
     def calibrate(self, task: CalibrationTask, progress: Progress) -> Outcome:
         """Fit the declared network."""
         from twin_core.calibrate import calibrate
-        from twin_core.calibrate.compiled import deadline_after
+        from twin_core.compiled import deadline_after
 
         deadline = deadline_after(task.deadline_s)
         siblings = {name: _model_of(document) for name, document in task.siblings.items()}

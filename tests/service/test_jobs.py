@@ -1,12 +1,15 @@
 """Calibrations and diagnoses as jobs, and the model versions that they leave."""
 
 import copy
+import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from service.workbench.interface import DiagnosisTask, Outcome, Progress
 from tests.service.conftest import SPEC, STORE
 from tests.service.fakes import FakeWorkbench
 from tests.service.harness import AppClient
@@ -174,6 +177,31 @@ def test_cancel_ends_a_running_job(client: AppClient) -> None:
     assert client.delete(path).json()["state"] == "cancelled"
     feed(client, 0.5, first=1000)
     assert finish(client, start(client))["state"] == "succeeded"
+
+
+class Brief(FakeWorkbench):
+    """Tells three short phases at once, and the fourth one lasts until there is a file."""
+
+    def diagnose(self, task: DiagnosisTask, progress: Progress) -> Outcome:
+        for fraction, phase in ((0.0, "reading"), (0.02, "fitting"), (0.2, "screening"), (0.21, "examining")):
+            progress(fraction, phase)
+        while not Path(os.environ["FAKE_GATE"]).exists():
+            time.sleep(0.02)
+        return super().diagnose(task, progress)
+
+
+def test_a_long_phase_after_short_ones_is_told(make_client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that follows a quick calibration stood at 0 with the words of what came before it."""
+    monkeypatch.setenv("FAKE_GATE", str(tmp_path / "gate"))
+    client = make_client(workbench=Brief)
+    client.post("/v1/twins", json=SPEC)
+    feed(client, 1.0)
+    path, until_s = start(client, "diagnoses"), time.monotonic() + 20.0
+    while (job := client.get(path).json())["message"] != "examining" and time.monotonic() < until_s:
+        time.sleep(0.02)
+    assert (job["state"], job["progress"], job["message"]) == ("running", 0.21, "examining")
+    (tmp_path / "gate").touch()
+    assert finish(client, path)["progress"] == 1.0
 
 
 def test_deadline(make_client) -> None:

@@ -334,6 +334,7 @@ def test_excluded_intervals_of_the_hold_out_are_not_scored() -> None:
 def test_progress_runs_from_start_to_end(run: Run) -> None:
     assert list(run.progress) == sorted(run.progress)
     assert 0.0 <= run.progress[0] < 0.1 and run.progress[-1] == 1.0
+    assert len(set(run.progress)) >= 20
 
 
 def test_a_loop_can_be_cancelled() -> None:

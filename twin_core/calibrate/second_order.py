@@ -25,6 +25,7 @@ from twin_core.network.model import Network, build_network
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
 from twin_core.once import once
+from twin_core.progress import Part
 from twin_core.side_by_side import both
 from twin_core.simulate.rollout import rollout
 from twin_core.telemetry import Record
@@ -162,7 +163,12 @@ def fit_network(
     progress(0.1, "fitting open-loop trajectories")
     failures: list[str] = []
     coarse = coarse_problem(problem, step)
-    search = best_of_starts(coarse, stands_for=problem.n_samples / coarse.n_samples, deadline=deadline)
+    search = best_of_starts(
+        coarse,
+        stands_for=problem.n_samples / coarse.n_samples,
+        deadline=deadline,
+        progress=Part(progress).part(0.1, 0.4),
+    )
     problem = recentred(problem, search.best)
     problem = with_noise_beside(problem, search.best.unknowns)
     on_trajectories = partial(minimise, problem, deadline=deadline)
@@ -234,7 +240,7 @@ def fit_trajectories(
         coarse,
         stands_for=problem.n_samples / coarse.n_samples,
         deadline=deadline,
-        progress=lambda share, message: progress(0.1 + 0.5 * share, message),
+        progress=Part(progress).part(0.1, 0.6),
     )
     best = search.best
     problem = with_noise_beside(recentred(problem, best), best.unknowns)

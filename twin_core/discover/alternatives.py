@@ -92,7 +92,11 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
     ]
     best = _best_of_each_place(state, simple, finding, options, least, goal)
     told = state.attempt_each(
-        [(partial(_supported, state, simple, t, needed), f"{t.effects[-1].label} instead of {own.label}") for t in best]
+        [
+            (partial(_supported, state, simple, t, needed), f"{t.effects[-1].label} instead of {own.label}")
+            for t in best
+        ],
+        state.progress.part(0.8, 1.0, ", weighing "),
     )
     return Finding(finding.judged, (*finding.alternatives, *once_each([j for j in told if j is not None])))
 
@@ -114,11 +118,12 @@ def _best_of_each_place(
     told: set[Place] = set()
     places = [effect.place for effect, _ in options]
     is_first = [places.index(place) == i for i, place in enumerate(places)]
-    for turn in (True, False):
+    first, then = state.progress.part(0.2, 0.6, ", "), state.progress.part(0.6, 0.8, " from other starts, ")
+    for turn, progress in ((True, first), (False, then)):
         asked = [o for o, own in zip(options, is_first, strict=True) if own is turn and o[0].place not in told]
         works = [partial(_explaining, simple, starts, effect, found, least, goal) for effect, starts in asked]
         labels = [f"{effect.label} instead of {finding.judged.labels}" for effect, _ in asked]
-        for trial in state.attempt_each(list(zip(works, labels, strict=True))):
+        for trial in state.attempt_each(list(zip(works, labels, strict=True)), progress):
             if trial is None:
                 continue
             place = trial.effects[-1].place

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from twin_core._typing import Progress, no_progress
 from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempted, check_time, limited
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
@@ -19,6 +20,7 @@ from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
 from twin_core.once import keep, known
+from twin_core.progress import Part
 from twin_core.side_by_side import ahead
 from twin_core.simulate.rollout import hurried
 
@@ -126,6 +128,8 @@ class Search:
         Trials from which the search went on, each with what had been found by then.
     without
         The trial so far, and by places what it is without the effects there, as far as anybody has asked.
+    progress
+        Told how far the search is, by this process alone: what a forked one told would be lost, or worse.
     """
 
     trial: Trial
@@ -140,6 +144,7 @@ class Search:
     first: Collection[Place] = ()
     past: tuple[Trial, ...] = ()
     without: tuple[Trial, dict[frozenset[object], "Without | None"]] | None = None
+    progress: Part = field(default_factory=Part)
 
     @contextmanager
     def until(self, deadline: float) -> Iterator[None]:
@@ -149,6 +154,15 @@ class Search:
             yield
         finally:
             self.deadline = own
+
+    @contextmanager
+    def during(self, start: float, stop: float, words: str = "") -> Iterator[None]:
+        """Tell progress as a part of what is under way, for a while."""
+        own, self.progress = self.progress, self.progress.part(start, stop, words)
+        try:
+            yield
+        finally:
+            self.progress = own
 
     def fork(self) -> "Search":
         """Return a search that starts from here and shares what failed or was left out."""
@@ -174,11 +188,17 @@ class Search:
             self.failures.append(f"{what}: {error}")
         return None
 
-    def attempt_each(self, works: Sequence[tuple[Callable[[], T], str]]) -> list[T | None]:
+    def attempt_each(
+        self, works: Sequence[tuple[Callable[[], T], str]], progress: Progress = no_progress
+    ) -> list[T | None]:
         """Return what :meth:`attempt` returns of each piece of work and its name, done side by side: what they change is lost."""
 
+        def told(i: int) -> T | None:
+            progress(i / len(works), f"{i + 1} of {len(works)}")
+            return result(i)
+
         with self.attempts_ahead(works) as result:
-            return [result(i) for i in range(len(works))]
+            return [told(i) for i in range(len(works))]
 
     @contextmanager
     def attempts_ahead(self, works: Sequence[tuple[Callable[[], T], str]]) -> Iterator[Callable[[int], T | None]]:

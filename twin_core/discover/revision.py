@@ -273,14 +273,16 @@ def tell_alternatives(state: Search, needed: float) -> None:
     A name is withdrawn where another one in its place is likelier by the odds asked for but predicts too little to be named:
     likelihood and prediction then contradict each other, and neither name can be told.
     """
-    for finding in list(state.findings):
+    findings = list(state.findings)
+    for i, finding in enumerate(findings):
         kept = attempted_without(state, finding.judged.places)
         if kept is None:
             continue
-        compared = state.attempt(
-            partial(add_coarse_alternatives, state, kept[0], finding, needed),
-            f"alternatives to {finding.judged.labels}",
-        )
+        with state.during(i / len(findings), (i + 1) / len(findings)):
+            compared = state.attempt(
+                partial(add_coarse_alternatives, state, kept[0], finding, needed),
+                f"alternatives to {finding.judged.labels}",
+            )
         if compared is None:
             continue
         position = next(i for i, f in enumerate(state.findings) if f is finding)

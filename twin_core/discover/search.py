@@ -42,8 +42,13 @@ from twin_core.discover.trajectories import (
 )
 from twin_core.discover.trial import Trial, converged, resettled, try_effects
 from twin_core.effects.base import Effect, Place
+from twin_core.progress import Part
 
 MAX_FINDINGS = 4
+LOOKS = 0.6
+"""Part of the progress up to which effects are looked for: half of what is left of it is that of each look, for most searches end
+after the first or second."""
+
 N_REFITS = 12
 N_FREE_PLACES = 2
 """Places at the head of each ranking at which a heat without a name is tried in all its forms."""
@@ -104,43 +109,56 @@ def search(
     Search
         With the findings in the order in which they were made.
     """
-    state = Search(base, base, deadline=deadline, first=first)
+    state = Search(base, base, deadline=deadline, first=first, progress=Part(progress))
+    state.progress(0.0, "settling the declared model")
     _converge(state)
     state.base = state.trial
     needed = threshold(false_alarm_rate)
     now = time.monotonic()
     looking = now + (1.0 - REVISION_SHARE) * (deadline - now)
     for step in range(MAX_FINDINGS):
-        progress(step / MAX_FINDINGS, f"looking for effect {step + 1}")
-        _converge(state)
-        state.past = (*state.past, state.trial)
-        known = _places(state)
-        with state.until(looking):
-            if not _extend(state, needed, fallback=False):
+        begun, done = (LOOKS * (1.0 - 0.5**n) for n in (step, step + 1))
+        with state.during(begun, done, f"effect {step + 1}: "):
+            if not _look(state, needed, looking):
                 break
-        complete(state, needed)
-        restart(state)
-        _converge(state)
-        prune(state, needed)
-        exchange(state, needed)
-        if _places(state) == known:
-            break  # what was found does not hold: the next step would find it again
+    state.progress(LOOKS, "revising what was found")
     foretell_together(state)
     withdraw(state, needed)
     if not state.findings:
-        progress(0.85, "looking beside temperature gradients within the nodes")
+        state.progress(0.65, "looking beside temperature gradients within the nodes")
         with state.until(looking):
             _look_beside_gradients(state, needed)
         withdraw(state, needed)
     if not state.findings:
-        progress(0.9, "looking for a repeatable heat flow")
-        with state.until(looking):
+        with state.until(looking), state.during(0.7, 0.8, "a repeatable heat flow: "):
             _extend(state, needed, fallback=True)
         withdraw(state, needed)
     reconsider(state, needed)
-    progress(0.95, "comparing what was found with other names")
-    tell_alternatives(state, needed)
+    with state.during(0.8, 1.0, "comparing with other names"):
+        state.progress(0.0, "")
+        tell_alternatives(state, needed)
     return state
+
+
+def _look(state: Search, needed: float, deadline: float) -> bool:
+    """Look for one more effect, or pair, and revise what was found with it; False if nothing more holds."""
+    state.progress(0.0, "settling the model so far")
+    _converge(state)
+    state.past = (*state.past, state.trial)
+    known = _places(state)
+    with state.until(deadline), state.during(0.0, 0.85):
+        if not _extend(state, needed, fallback=False):
+            return False
+    state.progress(0.85, "completing what was found")
+    complete(state, needed)
+    state.progress(0.9, "fitting it from other settings")
+    restart(state)
+    _converge(state)
+    state.progress(0.95, "revising what was found")
+    prune(state, needed)
+    state.progress(0.97, "trying other names in its place")
+    exchange(state, needed)
+    return _places(state) != known  # what was found and does not hold the next look would find again
 
 
 def _converge(state: Search) -> None:
@@ -183,10 +201,12 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     widened = not state.findings or state.trial.unexplained() > WIDENED
     by_heat, by_trajectory = state.fork(), state.fork()
     first = partial(_extend_by_heat, by_heat, needed, fallback=fallback)
-    told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
+    with by_heat.during(0.0, 0.5):
+        told, rankings = state.attempt(first, f"{what}, by what the filter leaves") or (False, [[]])
     # After the first finding pairs are left to the trajectories: by heat they took as long again and added none.
     if not (told or fallback or state.findings):
-        told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
+        with by_heat.during(0.5, 0.6, "two at a time, "):
+            told = bool(state.attempt(partial(_pairs_by_heat, by_heat, rankings[0], needed), f"{what}, two at a time"))
     after = by_heat.trial
     if not widened or (told and after.unexplained() <= policy.MOST_COARSENESS and stands(state.trial, after)):
         state.join(by_heat)
@@ -197,7 +217,8 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         second = partial(
             extend_by_trajectory, fork, needed, seeds, rankings[-1], n_together, fallback=fallback, known=known
         )
-        return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
+        with fork.during(*((0.6, 0.8, "") if n_together == 1 else (0.8, 1.0, "two together, "))):
+            return state.attempt(second, f"{what}, by open-loop residuals") or (False, [])
 
     def leaves(trial: Trial) -> float:
         return state.attempt(trial.misfit_share, "how much trajectories leave") or 0.0
@@ -235,6 +256,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bo
 
     There is one ranking for each size of the undeclared heat, the largest first.
     """
+    state.progress(0.0, "screening candidates")
     screenings = screened(state.trial, state.trial.fit, UNDECLARED_SHARES, fallback=fallback)
     rankings = [best_of_each_place(screening.probes, state.trial.n_samples) for screening in screenings]
     n_tried = state.count(max(len(ranked) for ranked in rankings), fallback=fallback)
@@ -248,6 +270,7 @@ def _extend_by_heat(state: Search, needed: float, *, fallback: bool) -> tuple[bo
 
 def _pairs_by_heat(state: Search, ranked: Sequence[Probe], needed: float) -> bool:
     """Extend by the two effects that innovations suggest together; False if none is supported."""
+    state.progress(0.0, "screening candidates")
     pairs = _best_pairs(ranked, state.trial, needed)
     return _accept_settled(state, pairs, max(state.n_named**2 // 2, 1), needed)
 
@@ -255,8 +278,12 @@ def _pairs_by_heat(state: Search, ranked: Sequence[Probe], needed: float) -> boo
 def _accept_settled(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int, needed: float) -> bool:
     """Keep the best option that passes, fitted until it settles; False if none does."""
     before = state.trial
-    if not accept(state, _by_heat(state, options, n_tried), needed):
+    with state.during(0.2, 0.7):
+        judged = _by_heat(state, options, n_tried)
+    state.progress(0.7, "examining candidates")
+    if not accept(state, judged, needed):
         return False
+    state.progress(0.9, "settling what was found")
     _settle(state, before, n_tried)
     return True
 
@@ -300,7 +327,8 @@ def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int)
 
     first = [partial(_judge, state, state.trial, option, n_tried, n_passes=3, quick=True) for option in options]
     labels = [" with ".join(effect.label for effect in option) for option in options]
-    quick = _done(state.attempt_each(list(zip(first, labels, strict=True))))
+    told = state.progress.part(0.0, 0.5, "fitting candidate ")
+    quick = _done(state.attempt_each(list(zip(first, labels, strict=True)), told))
     judged = sorted(quick, key=worth)
     best = judged[0].evidence.log_bayes_factor if judged else 0.0
     near = [j for j in judged[:N_SETTLED] if j.evidence.log_bayes_factor > best - SETTLING_NATS]
@@ -309,10 +337,11 @@ def _by_heat(state: Search, options: Sequence[tuple[Effect, ...]], n_tried: int)
     rivals = [*quick[:N_FIRST], *[j for j in likely if acts_at(j.trial, j.effects) == here][:N_FORMS]]
     near += [j for i, j in enumerate(rivals) if all(j is not n for n in [*near, *rivals[:i]])]
     further = [(partial(_judge, state, j.trial, j.effects, n_tried, n_passes=12), j.labels) for j in near]
-    settled = _done(state.attempt_each(further))
+    settled = _done(state.attempt_each(further, state.progress.part(0.5, 0.9, "fitting the best further, ")))
     rest = [j for j in judged if all(j is not n for n in near)]
     forms = _forms_of_the_best(settled)
-    compared = _done(state.attempt_each([(partial(_from_trajectories, state, j, n_tried), j.labels) for j in forms]))
+    works = [(partial(_from_trajectories, state, j, n_tried), j.labels) for j in forms]
+    compared = _done(state.attempt_each(works, state.progress.part(0.9, 1.0, "fitting its rivals, ")))
     return once_each([*settled, *compared, *rest])
 
 

@@ -79,6 +79,7 @@ def extend_by_trajectory(
     bool, list of Trial
         The best trials are the seeds of a next look, at one effect more together.
     """
+    state.progress(0.0, "screening along trajectories")
     own = _extensions(state, seeds, n_together, needed, fallback=fallback)
     # What the filter suggests beside little heat is no seed: it is far from where long trajectories point.
     close = _near_extensions(state, near, needed, fallback=fallback) if n_together == 1 else []
@@ -87,15 +88,17 @@ def extend_by_trajectory(
         for some, heat in ((own, False), (close, True))
         for extension in some
     ]
-    fitted = state.attempt_each(works)
+    fitted = state.attempt_each(works, state.progress.part(0.3, 0.7, "fitting along trajectories, "))
     sets, best = (once_each([j for j in some if j is not None])[:N_KEPT] for some in (fitted[: len(own)], fitted))
     if not best:
         return False, []
+    state.progress(0.7, "fitting the best further")
     options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
     if n_together > 1 and not fallback:
         options = [*_alone(state, best[0]), *options]
     if min(options, key=worth).places == known:
         return False, []
+    state.progress(0.8, "examining candidates")
     return accept(state, options, needed), [j.trial for j in sets]
 
 

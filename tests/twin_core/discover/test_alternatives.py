@@ -46,7 +46,7 @@ class Fits:
             "weigh": lambda simple, rich, n_tried: Evidence(rich.nats, 0.0),
         }.items():
             monkeypatch.setattr(alternatives, name, value)
-        monkeypatch.setattr(Search, "attempt_each", lambda state, works: [work() for work, _ in works])
+        monkeypatch.setattr(Search, "attempt_each", lambda state, works, *told: [work() for work, _ in works])
 
     def with_a(self, left: float) -> Any:
         found: Any = stub(load("a"), left=left)

@@ -1,4 +1,4 @@
-"""Deadlines, which begin to count once what fits need is compiled; as a command, compilation after an installation."""
+"""Deadlines, which begin to count once what a closed loop needs is compiled; as a command, compilation after an installation."""
 
 import time
 from contextlib import suppress
@@ -8,7 +8,11 @@ import numpy as np
 
 from twin_core.calibrate.containment import NO_DEADLINE, NUMERICAL_FAILURES
 from twin_core.calibrate.second_order import fit_network
+from twin_core.calibrate.summary import to_model
+from twin_core.discover.judge import Search
+from twin_core.discover.trial import Trial
 from twin_core.errors import ModelError
+from twin_core.missing_heat.smoothed import smooth_missing_heat
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -25,7 +29,7 @@ def deadline_after(seconds: float | None) -> float:
 
 @cache
 def compile_ahead() -> None:
-    """Fit a body that cools, once per process: after an installation that compiles the loops of a fit, later it loads them.
+    """Fit a body that cools, and smooth its heat, once per process: after an installation that compiles, later it loads.
 
     Half a minute of compilation within a search's deadline would leave guesses in the place of a fit.
     """
@@ -42,7 +46,10 @@ def compile_ahead() -> None:
     noise_K = 0.1 * np.random.default_rng(0).standard_normal(N_SAMPLES)
     read_K = 290.0 + 20.0 * np.exp(-time_s / 80.0) + noise_K
     with suppress(ModelError, *NUMERICAL_FAILURES):  # what fails here fails with its reason where it matters
-        fit_network(spec, [Record(time_s, {"T": read_K})])
+        fit, calibration = fit_network(spec, [Record(time_s, {"T": read_K})])
+        to_model(calibration, ())
+        base = Trial((), fit, calibration.max_step_s, (calibration.optimum,))
+        smooth_missing_heat(Search(base, base))
 
 
 if __name__ == "__main__":
