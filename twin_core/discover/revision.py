@@ -10,13 +10,14 @@ from twin_core.calibrate.containment import those_that_work
 from twin_core.discover import policy
 from twin_core.discover.alternatives import add_coarse_alternatives
 from twin_core.discover.coarseness import least_explained, times_asked, times_likely
-from twin_core.discover.evidence import validate, weigh
+from twin_core.discover.evidence import paid, validate, weigh
 from twin_core.discover.judge import (
     NO_FORESIGHT,
     NO_FORESIGHT_TOGETHER,
     NO_MORE,
     NOT_SUPPORTED,
     OUTDONE,
+    SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
     UNDECIDED,
     Finding,
@@ -100,6 +101,45 @@ def foretell_together(state: Search) -> None:
         _, gone, kept = min(foretold, key=lambda item: item[0])
         state.rejected.append(replace(gone.judged, validation=None, reason=NO_FORESIGHT_TOGETHER))
         _drop(state, gone.judged.places, *kept)
+
+
+def withdraw_contradicted(state: Search, needed: float) -> None:
+    """Withdraw a name beside which far more stays than a coarse network leaves, if a likelier option makes it superfluous.
+
+    The option was refused because its size is not determined or it does not predict well enough, so that it cannot be told; but
+    the readings speak for it by the odds asked for, and for the name no more once it is there. Then neither is told.
+    """
+    for finding in [f for f in state.findings if not all(effect.fallback for effect in f.effects)]:
+        if state.trial.unexplained() <= policy.MOST_COARSENESS:
+            return
+        option = next(
+            (j for j in _likelier_unlike(state, finding, needed) if _makes_superfluous(state, j, finding, needed)), None
+        )
+        kept = None if option is None else attempted_without(state, finding.judged.places)
+        if option is not None and kept is not None:
+            state.rejected = [replace(j, reason=UNDECIDED) if j is option else j for j in state.rejected]
+            state.rejected.append(replace(finding.judged, reason=UNDECIDED))
+            _drop(state, finding.judged.places, *kept)
+
+
+def _likelier_unlike(state: Search, finding: Finding, needed: float) -> list[Judged]:
+    """Return refused options without the effects of a finding that are likelier than all that was found, the likeliest first."""
+    others = [j for j in state.rejected if j.reason in (NO_FORESIGHT, SIZE_NOT_DETERMINED)]
+    unlike = [j for j in others if not {effect.place for effect in j.trial.effects} & finding.judged.places]
+    found = state.trial.log_evidence()
+    likelier = [j for j in unlike if paid(j.trial.log_evidence() - found, state.trial, j.trial, 1) > needed]
+    return sorted(likelier, key=lambda j: -j.trial.log_evidence())
+
+
+def _makes_superfluous(state: Search, option: Judged, finding: Finding, needed: float) -> bool:
+    """Return whether a finding is not supported beside an option."""
+
+    def gained() -> float:
+        beside = try_effects(option.trial, (*option.trial.effects, *finding.effects), n_passes=12)
+        return weigh(option.trial, beside, 1).log_bayes_factor
+
+    nats = state.attempt(gained, f"{finding.judged.labels} beside {option.labels}")
+    return nats is not None and nats <= needed
 
 
 def _foretold(state: Search, trial: Trial, what: str) -> float | None:

@@ -30,7 +30,14 @@ from twin_core.discover.judge import (
     worth,
 )
 from twin_core.discover.restart import restart
-from twin_core.discover.revision import foretell_together, prune, reconsider, tell_alternatives, withdraw
+from twin_core.discover.revision import (
+    foretell_together,
+    prune,
+    reconsider,
+    tell_alternatives,
+    withdraw,
+    withdraw_contradicted,
+)
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
 from twin_core.discover.trajectories import (
@@ -124,6 +131,7 @@ def search(
     state.progress(LOOKS, "revising what was found")
     foretell_together(state)
     withdraw(state, needed)
+    withdraw_contradicted(state, needed)
     if not state.findings:
         state.progress(0.65, "looking beside temperature gradients within the nodes")
         with state.until(looking):
@@ -226,7 +234,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
     by_pairs, paired = state.fork(), False
     misfit = leaves(state.trial)
     seen, sets = look(by_trajectory, [state.trial], 1) if misfit >= LEAST_MISFIT_SHARE else (False, [])
-    least = min(misfit, leaves(by_trajectory.trial)) if seen else misfit
+    least = min([misfit, *(leaves(fork.trial) for fork, found in ((by_heat, told), (by_trajectory, seen)) if found)])
     if not fallback and sets and least >= TOGETHER_MISFIT_SHARE:
         beside = [] if told else _unseen_by_trajectories(by_heat.rejected[len(state.rejected) :])
         paired, _ = look(by_pairs, [*sets, *beside], 2)

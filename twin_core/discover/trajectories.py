@@ -97,7 +97,7 @@ def extend_by_trajectory(
     if n_together > 1 and not fallback:
         options = [*_alone(state, best[0]), *options]
     if min(options, key=worth).places == known:
-        return False, []
+        return False, [j.trial for j in sets]
     state.progress(0.8, "examining candidates")
     return accept(state, options, needed), [j.trial for j in sets]
 

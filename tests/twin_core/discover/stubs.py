@@ -70,6 +70,7 @@ class Stub:
     foresight: float = 1.0
     along: float = 0.0
     beside: float | None = None
+    nats: float = 0.0
     fit: Fit = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,7 +89,7 @@ class Stub:
         return float(self.excess().mean())
 
     def log_evidence(self) -> float:
-        return 0.0
+        return self.nats
 
     def calibration(self) -> Any:
         return SimpleNamespace(log_posterior=self.along)

@@ -457,14 +457,36 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
     assert asked == [[by_filter, by_trajectory] if n_together == 1 else [by_trajectory]]
 
 
+@pytest.mark.parametrize("known", ["a", "c"])
+def test_what_is_known_to_hold_is_not_examined_again_but_extended_by_another_one(
+    monkeypatch: pytest.MonkeyPatch, known: str
+) -> None:
+    """A power law was the likeliest single effect, held, and no pair was looked for, though 67 times the noise stayed."""
+    option, asked, base = judged("a", 50.0), list[object](), stub()
+    monkeypatch.setattr(trajectories, "_extensions", lambda *arguments, fallback: [(base, load("a"), 5)])
+    monkeypatch.setattr(trajectories, "_near_extensions", lambda *arguments, fallback: [])
+    monkeypatch.setattr(trajectories, "_fitted", lambda *arguments, beside_heat: option)
+    monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
+    monkeypatch.setattr(trajectories, "accept", lambda *arguments: asked.append(arguments) or True)
+    place = {load(known).place}
+    told, seeds = trajectories.extend_by_trajectory(
+        Search(base, base, n_named=5), NEEDED, [base], [], 1, fallback=False, known=place
+    )
+    assert told == bool(asked) == (known != "a")
+    assert seeds == [option.trial]
+
+
+@pytest.mark.parametrize("is_by_heat", [False, True])
 @pytest.mark.parametrize(
     ("beside", "pairs", "leads"),
     [(3.0 - JUST, 0.1, "single"), (3.0, 0.1, "pair"), (3.0, 0.6, "single")],
     ids=["leaves little", "predicts better", "predicts worse"],
 )
 def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
-    monkeypatch: pytest.MonkeyPatch, beside: float, pairs: float, leads: str
+    monkeypatch: pytest.MonkeyPatch, beside: float, pairs: float, leads: str, *, is_by_heat: bool
 ) -> None:
+    """Whichever look has found the single one."""
+
     def trial(*effects: Effect, misfit: float) -> Trial:
         made = stub(*effects, left=9.0)
         made.misfit_share = lambda: misfit  # type: ignore[method-assign]
@@ -474,14 +496,22 @@ def test_pairs_are_looked_for_where_a_single_effect_leaves_much(
         fork: Search, needed: float, seeds: list[Trial], near: object, n: int, *, fallback: bool, known: object
     ) -> tuple[bool, list[Trial]]:
         node, foresight = ("single", 0.5) if n == 1 else ("pair", pairs)
+        if is_by_heat and n == 1:
+            return False, [base]
         fork.trial = trial(load(node), misfit=beside)
         fork.findings.append(Finding(replace(judged(node, 50.0, foresight=foresight), trial=fork.trial)))
         return True, [fork.trial]
 
+    def by_heat(fork: Search, needed: float, *, fallback: bool) -> tuple[bool, list[list[Any]]]:
+        if is_by_heat:
+            fork.trial = trial(load("single"), misfit=beside)
+            fork.findings.append(Finding(replace(judged("single", 50.0), trial=fork.trial)))
+        return is_by_heat, [[]]
+
     base = trial(misfit=20.0)
     base.fit = cast(Any, None)  # type: ignore[misc]
     monkeypatch.setattr(searching, "gain_of_undeclared_heat", lambda fit: 99.0)
-    monkeypatch.setattr(searching, "_extend_by_heat", lambda *arguments, fallback: (False, [[]]))
+    monkeypatch.setattr(searching, "_extend_by_heat", by_heat)
     monkeypatch.setattr(searching, "_pairs_by_heat", lambda *arguments: False)
     monkeypatch.setattr(searching, "extend_by_trajectory", look)
     state = Search(base, base)

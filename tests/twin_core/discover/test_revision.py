@@ -50,6 +50,7 @@ from twin_core.discover.revision import (
     reconsider,
     tell_alternatives,
     withdraw,
+    withdraw_contradicted,
 )
 from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
@@ -543,6 +544,49 @@ def test_a_name_is_withdrawn_where_a_far_likelier_one_predicts_no_better(
     assert [e.name for f in state.findings for e in f.effects] == told
     assert [j.reason for j in state.rejected] == ([] if told else [UNDECIDED] * 2)
     assert (state.trial is without) == (not told)
+
+
+FAR_LIKELIER = 60.0 + NEEDED + 0.5 * float(np.log(N_READINGS))
+"""Log-likelihood from which an option with as many parameters is likelier than a finding of 60 nats by the odds asked for."""
+
+
+@pytest.mark.parametrize(
+    ("nats", "beside", "left", "place", "reason", "kept"),
+    [
+        (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", SIZE_NOT_DETERMINED, False),
+        (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", NO_FORESIGHT, False),
+        (FAR_LIKELIER, NEEDED, MOST + JUST, "b", SIZE_NOT_DETERMINED, True),
+        (FAR_LIKELIER + JUST, NEEDED + JUST, MOST + JUST, "b", SIZE_NOT_DETERMINED, True),
+        (FAR_LIKELIER + JUST, NEEDED, MOST, "b", SIZE_NOT_DETERMINED, True),
+        (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "a", SIZE_NOT_DETERMINED, True),
+        (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", NO_LAW, True),
+    ],
+    ids=[
+        "no size",
+        "no foresight",
+        "hardly likelier",
+        "both supported",
+        "coarseness",
+        "holds it itself",
+        "another reason",
+    ],
+)
+def test_a_name_is_withdrawn_that_a_likelier_option_makes_superfluous(
+    monkeypatch: pytest.MonkeyPatch, nats: float, beside: float, left: float, place: str, reason: str, kept: bool
+) -> None:
+    """A power law of 16 nats, say, where a hidden mass with a lag has 343, of undetermined size: one foretold nothing."""
+    found, option = judged("a", 60.0, left=left), replace(judged(place, nats), reason=reason)
+    for trial, of in ((found.trial, 60.0), (option.trial, nats)):
+        stubbed: Any = trial
+        stubbed.nats = of
+    without = stub()
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (without, 60.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(beside, 0.0))
+    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[option])
+    withdraw_contradicted(state, NEEDED)
+    assert bool(state.findings) == kept == (state.trial is not without)
+    assert [j.reason for j in state.rejected] == ([reason] if kept else [UNDECIDED] * 2)
 
 
 def test_a_heat_without_a_name_is_not_contradicted_by_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
