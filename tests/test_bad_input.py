@@ -241,7 +241,10 @@ TELEMETRY: list[tuple[str | bytes, str]] = [
         HEAD + "".join(f"2026-01-01T00:00:00Z,{20 + k},293,5\n" for k in range(10)),
         "all 10 rows have the same time, 2026-01-01T00:00:00Z; give each row the time of its own sample",
     ),
-    (HEAD.replace("time", "time_s") + 3 * "7,20,293,5\n", "column 'time_s': all 3 rows have the same time, 7; give"),
+    (
+        HEAD.replace("time", "time_s") + "".join(f"7,2{k},293,5\n" for k in range(3)),
+        "column 'time_s': all 3 rows have the same time, 7; give",
+    ),
     (HEAD + "2026-01-01T00:00:00Z,20,,5\n2026-01-01T00:01:00Z,20,,5\n", "channel 'T_b' has no samples"),
     (HEAD + "2026-01-01T00:00:00Z,20,0,5\n2026-01-01T00:01:00Z,20,0,5\n", "all its samples are masked (sentinel)"),
     (HEAD + "2026-01-01T00:00:00Z,20,293,\n2026-01-01T00:01:00Z,20,293,\n", "channel 'Q_a' has no samples"),
@@ -324,7 +327,7 @@ ARGUMENTS: list[tuple[str, str]] = [
     ),
     (
         "forecast --model model.json --telemetry data.csv --horizon 59 --out x.csv",
-        "'--step': must be positive and at most the horizon of 59 s; it is 60 s (default: the sampling interval)",
+        "'--step': must be positive and at most the horizon of 59 s; it is 60 s; where none is given it is the sampling interval",
     ),
     (
         "forecast --model model.json --telemetry data.csv --horizon 1d --step 0.001 --out x.csv",

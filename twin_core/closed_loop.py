@@ -136,7 +136,7 @@ def close_loop(
             told = whole_loop.part(0.2, 0.8)
             found = search(base, false_alarm_rate=false_alarm_rate, deadline=deadline, first=tried_first, progress=told)
         found.every = every
-        progress(0.8, "looking for mistakes of the declaration")
+        progress(0.8, "checking the specification for mistakes")
         doubts = look_for_mistakes(found, deadline=latest)
         if doubts.outdo(found):
             found.give_up(MISTAKE)

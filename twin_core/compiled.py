@@ -29,7 +29,7 @@ def deadline_after(seconds: float | None) -> float:
 
 @cache
 def compile_ahead() -> None:
-    """Fit a body that cools, and smooth its heat, once per process: after an installation that compiles, later it loads.
+    """Fit a body that cools, and smooth its heat, once per process: that compiles all loops after an installation, or loads them.
 
     Half a minute of compilation within a search's deadline would leave guesses in the place of a fit.
     """

@@ -86,7 +86,7 @@ def split_fraction(records: Sequence[Record], fraction: float) -> tuple[list[Rec
         kept -= span
     if not train or not held:
         raise TelemetryError(
-            f"{names}: cannot be split by a hold-out of {fraction:g}; choose a larger one, or put single samples into one file"
+            f"{names}: cannot be split by a hold-out of {fraction:g}; choose another one, or put single samples into one file"
         )
     return train, held
 

@@ -72,7 +72,7 @@ def read_segments(path: Path | str, spec: TwinSpec, *, required: Collection[str]
     values = {name: _in_si(table, name, spec.channels[name], column) for name, column in table.numbers(names).items()}
     notices = list(ignored_notice(str(path), table.header[1:], spec))
     kept = _first_of_instants(str(path), clock, values, notices)
-    _refuse_standing_clock(table, kept)
+    _refuse_standing_clock(table, values, kept)
     segments: list[Record] = []
     for rows in _forward_runs(table, clock, kept, notices):
         epoch_ns = int(clock[rows[0]]) if dated else None
@@ -103,9 +103,10 @@ def _first_of_instants(
     return np.setdiff1d(np.arange(clock.size), repeats)
 
 
-def _refuse_standing_clock(table: CsvTable, kept: IntArray) -> None:
-    """Refuse a file all of whose rows carry one instant; two of them may be one sample that was sent twice."""
-    if kept.size == 1 and table.line.size > 2:
+def _refuse_standing_clock(table: CsvTable, values: Mapping[str, FloatArray], kept: IntArray) -> None:
+    """Refuse a file all of whose rows carry one instant though their values change; the same row may be sent many times."""
+    changes = any((column != column[0])[np.isfinite(column)].any() for column in values.values())
+    if kept.size == 1 and table.line.size > 2 and changes:
         time, at = table.header[0], table.texts(table.header[0])[0]
         raise TelemetryError(
             f"{table.name}: column '{time}': all {table.line.size} rows have the same time, {at}; give each row the time of "

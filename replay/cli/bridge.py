@@ -114,7 +114,7 @@ def xtce(config: Path, service: str, key: str | None, out: Path) -> None:
     _need("yamcs", "Yamcs' client", "yamcs")
     from replay.bridges.yamcs_mdb import write_xtce
     from replay.bridges.yamcs_names import published_names
-    from twin_core.wording import counted
+    from replay.wording import counted
 
     try:
         with TwinClient(service, key) as client:

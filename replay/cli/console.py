@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from twin_core.wording import counted
+from replay.wording import counted
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -63,7 +63,7 @@ def convert(
     from replay.cli.console import notify, print_line, to_json
     from replay.cli.play import _renames
     from replay.cli.recordings import check_suffix
-    from twin_core.wording import counted
+    from replay.wording import counted
 
     check_suffix(out)
     wish = Wish(kind, time_name, Stated(scale, epoch, time_unit), xtce, container)
@@ -125,8 +125,8 @@ def _fitted(recording: "Recording", spec: Path, renames: dict[str, str]) -> "tup
     from replay.bridges.units import conversion
     from replay.mapping import apply_mapping, map_topics
     from replay.recording import Recording
+    from replay.wording import counted
     from twin_core.network.spec_io import load_spec
-    from twin_core.wording import counted
 
     channels = load_spec(spec).channels
     mapping = map_topics(list(recording.columns), list(channels), renames, ignore_others=True)

@@ -59,11 +59,11 @@ def export(model: Path, out: Path, as_fmu: bool, deck: Path | None, as_spec: boo
         write_text(out, _known(found.spec, found.values, out))
         print_line(f"wrote {out}: every value known")
         return
+    from replay.wording import counted
     from twin_core.interchange.esatan import read_esatan
     from twin_core.interchange.esatan_patch import as_patch, patched
     from twin_core.network.model import build_network
     from twin_core.network.spec_io import load_spec
-    from twin_core.wording import counted
 
     try:
         text = deck.read_text(encoding="utf-8", errors="replace")

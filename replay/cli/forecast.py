@@ -61,9 +61,9 @@ def forecast(
     from replay.cli.console import notify, print_line, to_json
     from replay.cli.models import load_model
     from replay.cli.recordings import check_suffix, load_segments
+    from replay.wording import counted
     from twin_core.errors import ArgumentError, TelemetryError
     from twin_core.forecast import forecast as look_ahead
-    from twin_core.wording import counted
 
     check_suffix(out, _OUT)
     if len(telemetry) > 1:

@@ -85,9 +85,9 @@ def import_model(
     --skip-unknown.
     """
     from replay.cli.console import notify, print_line, sizes, to_json
+    from replay.wording import counted
     from twin_core.errors import SpecError
     from twin_core.network.spec_io import load_spec
-    from twin_core.wording import counted
 
     if out.suffix not in (".yaml", ".yml", ".json"):
         raise click.UsageError(f"--out {out} must end in .yaml or .json")

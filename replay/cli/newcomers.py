@@ -33,10 +33,10 @@ def init(telemetry: Path, out: Path, sink: str) -> None:
     import yaml
 
     from replay.cli.console import notify, print_line
+    from replay.wording import counted
     from twin_core.errors import SpecError
     from twin_core.files import write_text
     from twin_core.network.spec_io import load_spec
-    from twin_core.wording import counted
 
     if out.exists():
         raise SpecError(f"{out}: exists already; name another file")
@@ -136,10 +136,10 @@ def check(spec: Path, telemetry: tuple[Path, ...], as_json: bool) -> None:
     """
     from replay.cli.console import print_line, sizes, to_json
     from replay.cli.recordings import load_records, too_short
+    from replay.wording import counted
     from twin_core.errors import SpecError, TwinError
     from twin_core.network.doubts import isolated
     from twin_core.network.spec_io import load_spec, read_mapping
-    from twin_core.wording import counted
 
     read_mapping(spec)  # a file that is no mapping is bad input, not an answer
     problems: list[str] = []
@@ -165,7 +165,7 @@ def check(spec: Path, telemetry: tuple[Path, ...], as_json: bool) -> None:
         for line in problems:
             print_line(f"{spec}: {line}" if not line.startswith(str(spec)) else line)
         for line in doubts:
-            print_line(f"likely a mistake: {line}")
+            print_line(f"doubt: {line}")
         if known is not None and not problems:
             state = f"{counted(len(doubts), 'doubt')}, listed above" if doubts else "in order"
             print_line(f"{known.twin}: {state}; {sizes(known)}")

@@ -12,6 +12,7 @@ from replay.errors import ReplayError
 from replay.mapping import apply_mapping, map_topics
 from replay.mcap_io import read_mcap, read_mcap_segments, write_mcap
 from replay.recording import Recording
+from replay.wording import counted
 from twin_core.errors import TelemetryError
 from twin_core.network.screened import all_screened
 from twin_core.network.spec import TwinSpec
@@ -27,7 +28,6 @@ from twin_core.telemetry_csv import (
     write_columns,
 )
 from twin_core.units import format_instant, from_si, to_si
-from twin_core.wording import counted
 
 if TYPE_CHECKING:
     from twin_core.fem.film import Film
@@ -123,7 +123,7 @@ def too_short(records: Sequence[Record]) -> list[str]:
     names = ", ".join(dict.fromkeys(record.name for record in records))
     return [
         f"{names}: {counted(count, 'sample')} in all, too few to determine parameters reliably; give at least "
-        f"{LEAST_SAMPLES} samples, better those of an orbit or of several time constants"
+        f"{LEAST_SAMPLES} samples, preferably over a full orbit or several time constants"
     ]
 
 

@@ -7,12 +7,12 @@ import click
 import numpy as np
 
 from replay.cli.recordings import LEAST_SAMPLES
+from replay.wording import counted
 from twin_core.calibrate.approach import thinned
 from twin_core.errors import TelemetryError
 from twin_core.network.spec import TwinSpec
 from twin_core.telemetry import Record
 from twin_core.units import calendar_instant
-from twin_core.wording import counted
 
 
 @dataclass(frozen=True)

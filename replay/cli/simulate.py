@@ -23,11 +23,11 @@ def simulate(scenario: Path, out: Path, field_every: float | None, as_json: bool
     """Simulate orbits of a spacecraft by finite elements and record its telemetry."""
     from replay.cli.console import print_line, progress_bar, to_json
     from replay.cli.recordings import check_suffix, save_record
+    from replay.wording import counted
     from twin_core.fem.film import Film
     from twin_core.fem.scenario import load_scenario
     from twin_core.fem.simulate import no_watch
     from twin_core.fem.simulate import simulate as run
-    from twin_core.wording import counted
 
     check_suffix(out)
     if field_every is not None and out.suffix != ".mcap":

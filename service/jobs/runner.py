@@ -38,7 +38,7 @@ log = logging.getLogger("service.jobs")
 
 REPORT_EVERY_S, REPORTS_AT_ONCE = 0.3, 50
 """How often a job's progress is written in the long run, and how many times at once: after short phases a long one may follow,
-whose words must not be lost."""
+whose words are seldom lost so."""
 
 VALIDATION_SHARE = 0.2
 """Share of the time span, at its end, that a calibration holds back to score itself and its rival."""

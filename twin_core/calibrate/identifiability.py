@@ -286,8 +286,8 @@ def blurred_levels(network: Network, records: Sequence[Record]) -> list[str]:
 
 
 def resting_channels(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
-    """Return a statement for every sensor and input that never changes."""
-    said = []
+    """Return a statement for every sensor and input that never changes, and one where no power is recorded."""
+    said = nothing_is_heated(spec, records)
     for name in resting([*spec.sensors, *dict.fromkeys(load.channel for load in spec.loads)], records):
         meaning = (
             "what rests tells nothing of capacities, and no effect is looked for beside it; if the sensor is stuck, take it out"
@@ -310,10 +310,11 @@ def resting(names: Iterable[str], records: Sequence[Record]) -> list[str]:
 
 
 def nothing_is_heated(spec: TwinSpec, records: Sequence[Record]) -> list[str]:
-    """Return in words that every power is zero throughout, where any is declared: what else seems wrong may come of that."""
+    """Return in words that every power is zero throughout, where nothing else heats: what else seems wrong may come of that."""
     names = list(dict.fromkeys(load.channel for load in spec.loads))
+    of_powers = all(name in spec.channels and spec.channels[name].kind == "power" for name in names)
     columns = [record.values.get(name) for record in records for name in names]
-    if not columns or any(column is None or np.nan_to_num(column).any() for column in columns):
+    if not columns or not of_powers or any(column is None or np.nan_to_num(column).any() for column in columns):
         return []
     channels = f"power channel '{names[0]}' is" if len(names) == 1 else f"all power channels ({', '.join(names)}) are"
     return [f"{channels} zero throughout: before anything else is believed, check whether powers were recorded"]

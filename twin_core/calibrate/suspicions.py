@@ -162,7 +162,7 @@ class Looked:
                 "swapped sensors, misplaced loads, known values, missing couplings); the computing time did not allow for "
                 f"the other {self.possible - self.tried:,}, one of which may be the cause"
             )
-        return "checked all possible single mistakes in the specification, but not all of the likeliest of them closely"
+        return "checked all possible single mistakes in the specification, but not all of the likeliest ones in detail"
 
 
 def declared_of(problem: Problem) -> Declared:

@@ -44,6 +44,7 @@ MISTAKE = "a mistake of the declaration would explain the readings better withou
 NO_MORE = "it explains no more than what stays unexplained beside it, which a lumped network may leave as well"
 OUTDONE = "another effect in its place explains the readings better"
 UNDECIDED = "one name predicts better and another one is far likelier, so that neither is told"
+SUPERFLUOUS = "a far likelier effect, which cannot be named itself, explains what it explains"
 COINCIDES = "it sets in when an input changes as nowhere else, which a law of that input would look like"
 AT_AN_END = "it sets in or ends where the record does, where too little tells it from what was so all along"
 NOT_EXAMINED = "its predictions could not be examined"

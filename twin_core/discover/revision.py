@@ -19,6 +19,7 @@ from twin_core.discover.judge import (
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
+    SUPERFLUOUS,
     UNDECIDED,
     Finding,
     Judged,
@@ -103,40 +104,54 @@ def foretell_together(state: Search) -> None:
         _drop(state, gone.judged.places, *kept)
 
 
-def withdraw_contradicted(state: Search, needed: float) -> None:
-    """Withdraw a name beside which far more stays than a coarse network leaves, if a likelier option makes it superfluous.
+def withdraw_superfluous(state: Search, needed: float) -> None:
+    """Withdraw a name beside which more stays than a coarse network leaves, if a far likelier option makes it superfluous.
 
-    The option was refused because its size is not determined or it does not predict well enough, so that it cannot be told; but
-    the readings speak for it by the odds asked for, and for the name no more once it is there. Then neither is told.
+    The option was refused because its size is not determined, or because it does not predict well enough, so that it cannot be
+    named; but the readings speak for it by far, and no longer for the name once the option is there. Each name is asked against
+    the same options, and what is left is examined as before.
     """
+    likelier = state.attempt(
+        partial(_far_likelier, state, needed), "refused options that are likelier than what was found"
+    )
+    gone: list[Finding] = []
     for finding in [f for f in state.findings if not all(effect.fallback for effect in f.effects)]:
-        if state.trial.unexplained() <= policy.MOST_COARSENESS:
-            return
-        option = next(
-            (j for j in _likelier_unlike(state, finding, needed) if _makes_superfluous(state, j, finding, needed)), None
-        )
-        kept = None if option is None else attempted_without(state, finding.judged.places)
-        if option is not None and kept is not None:
-            state.rejected = [replace(j, reason=UNDECIDED) if j is option else j for j in state.rejected]
-            state.rejected.append(replace(finding.judged, reason=UNDECIDED))
+        unlike = [j for j in likelier or () if not {e.place for e in j.trial.effects} & finding.judged.places]
+        if any(_makes_superfluous(state, option, finding, needed) for option in unlike):
+            gone.append(finding)
+    for finding in gone:
+        kept = attempted_without(state, finding.judged.places)
+        if kept is not None:
+            state.rejected += [replace(j, reason=SUPERFLUOUS) for j in (finding.judged, *finding.alternatives)]
             _drop(state, finding.judged.places, *kept)
+    if gone and state.findings:
+        withdraw(state, needed)
 
 
-def _likelier_unlike(state: Search, finding: Finding, needed: float) -> list[Judged]:
-    """Return refused options without the effects of a finding that are likelier than all that was found, the likeliest first."""
-    others = [j for j in state.rejected if j.reason in (NO_FORESIGHT, SIZE_NOT_DETERMINED)]
-    unlike = [j for j in others if not {effect.place for effect in j.trial.effects} & finding.judged.places]
+def _far_likelier(state: Search, needed: float) -> list[Judged]:
+    """Return refused options that are likelier than all that was found, the likeliest first, where more stays than coarseness.
+
+    By the odds asked for, chosen among all that were tried, and by so many times what chance makes of the log-likelihood of so
+    many readings as a name must be likelier by that explains too little (``DOMINANCE``).
+    """
+    if not state.findings or state.trial.unexplained() <= policy.MOST_COARSENESS:
+        return []
+    margin = needed + policy.DOMINANCE * float(np.sqrt(0.5 * state.trial.n_samples))
+    refused = [j for j in state.rejected if j.reason in (NO_FORESIGHT, SIZE_NOT_DETERMINED)]
     found = state.trial.log_evidence()
-    likelier = [j for j in unlike if paid(j.trial.log_evidence() - found, state.trial, j.trial, 1) > needed]
-    return sorted(likelier, key=lambda j: -j.trial.log_evidence())
+    gains = [(paid(j.trial.log_evidence() - found, state.trial, j.trial, max(state.n_named, 1)), j) for j in refused]
+    return [j for gain, j in sorted(gains, key=lambda item: -item[0]) if gain > margin]
 
 
 def _makes_superfluous(state: Search, option: Judged, finding: Finding, needed: float) -> bool:
-    """Return whether a finding is not supported beside an option."""
+    """Return whether a finding is not supported beside an option: by the likelier of fits from either."""
 
     def gained() -> float:
-        beside = try_effects(option.trial, (*option.trial.effects, *finding.effects), n_passes=12)
-        return weigh(option.trial, beside, 1).log_bayes_factor
+        both = (*option.trial.effects, *finding.effects)
+        fits = those_that_work(
+            [partial(try_effects, start, both, n_passes=12) for start in (option.trial, state.trial)]
+        )
+        return max(weigh(option.trial, fit, 1).log_bayes_factor for fit in fits)
 
     nats = state.attempt(gained, f"{finding.judged.labels} beside {option.labels}")
     return nats is not None and nats <= needed

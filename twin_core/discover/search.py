@@ -36,7 +36,7 @@ from twin_core.discover.revision import (
     reconsider,
     tell_alternatives,
     withdraw,
-    withdraw_contradicted,
+    withdraw_superfluous,
 )
 from twin_core.discover.screen import Probe, joint_gain, projected_responses, survey_of
 from twin_core.discover.shortlist import UNDECLARED_SHARES, best_of_each_place, refined, screened, shortlist
@@ -53,8 +53,8 @@ from twin_core.progress import Part
 
 MAX_FINDINGS = 4
 LOOKS = 0.6
-"""Part of the progress up to which effects are looked for: half of what is left of it is that of each look, for most searches end
-after the first or second."""
+"""Fraction of the progress at which the looks for effects end. Each look is given half of what is left of it, since most searches
+end after the first or second."""
 
 N_REFITS = 12
 N_FREE_PLACES = 2
@@ -131,17 +131,19 @@ def search(
     state.progress(LOOKS, "revising what was found")
     foretell_together(state)
     withdraw(state, needed)
-    withdraw_contradicted(state, needed)
+    withdraw_superfluous(state, needed)
     if not state.findings:
         state.progress(0.65, "looking beside temperature gradients within the nodes")
         with state.until(looking):
             _look_beside_gradients(state, needed)
         withdraw(state, needed)
+        withdraw_superfluous(state, needed)
     if not state.findings:
         with state.until(looking), state.during(0.7, 0.8, "a repeatable heat flow: "):
             _extend(state, needed, fallback=True)
         withdraw(state, needed)
     reconsider(state, needed)
+    withdraw_superfluous(state, needed)
     with state.during(0.8, 1.0, "comparing with other names"):
         state.progress(0.0, "")
         tell_alternatives(state, needed)

@@ -199,7 +199,7 @@ def _check(horizon_s: float, step_s: float, quantiles: Sequence[float], max_step
     if not (np.isfinite(horizon_s) and horizon_s > 0):
         raise ArgumentError("horizon_s", f"must be a positive number of seconds (got {horizon_s})")
     if not (np.isfinite(step_s) and 0 < step_s <= horizon_s):
-        it_is = f"it is {step_s:g} s (default: the sampling interval)"
+        it_is = f"it is {step_s:g} s; where none is given it is the sampling interval"
         raise ArgumentError("step_s", f"must be positive and at most the horizon of {horizon_s:g} s; {it_is}")
     if horizon_s / step_s > MAX_POINTS:
         asked = f"{horizon_s / step_s:.0f} points asked for, {MAX_POINTS} at most"

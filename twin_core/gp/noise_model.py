@@ -24,7 +24,8 @@ CLIMBS = 2
 """Best starting points from which the likelihood is climbed."""
 
 SETTLED_NATS, MOST_STEPS = 1e-5, 100
-"""A climb ends where a step promises no more, or after so many: a limit of accuracy and one of time."""
+"""A climb ends after a step that gains less, or after so many: a limit of accuracy (what damped steps leave undone was a few
+thousandths of a nat at most on residuals of the suites) and one of time."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-6, 1e6
 """Shares of the information that are added to its diagonal (Levenberg and Marquardt)."""
 LONGEST_STEP = 1.0
@@ -135,9 +136,9 @@ def _whiten(
 
 @njit(cache=True)
 def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-    """Return the log-likelihood, its gradient in ln(sigma_ou), ln(length), ln(sigma_white), and Fisher's information on them.
+    """Return the log-likelihood, its gradient in ln(sigma_ou), ln(length), ln(sigma_white), and the Fisher information on them.
 
-    Of the information (3, 3) the part that follows from the surprises is what they show, not what is expected of them.
+    Of the information (3, 3) the term from the innovations is observed, not expected.
     """
     colour, white = np.exp(2.0 * log_values[0]), np.exp(2.0 * log_values[2])
     inverse_length = np.exp(-log_values[1])
@@ -190,7 +191,7 @@ def _score(step_s: FloatArray, residual: FloatArray, log_values: FloatArray) -> 
 def _bounded_step(
     gradient: FloatArray, information: FloatArray, damping: float, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return the damped step of Fisher's scoring; where it would pass a bound it ends there, and the others follow from that."""
+    """Return the damped step of Fisher scoring; where it would pass a bound it ends there, and the others follow from that."""
     step = np.zeros(3)
     held = np.zeros(3, dtype=np.bool_)
     for p in range(3):
@@ -215,7 +216,7 @@ def _bounded_step(
 def _climb(
     step_s: FloatArray, residual: FloatArray, start: FloatArray, low: FloatArray, high: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return the greatest log-likelihood between bounds and where it is, by damped steps of Fisher's scoring from a start.
+    """Return the greatest log-likelihood between bounds and where it is, by damped steps of Fisher scoring from a start.
 
     SciPy's minimisers ask for the likelihood some four times as often, and hand over from compiled code each time.
     """

@@ -169,9 +169,9 @@ def _told(deck: Deck, unread: bool, driven: Sequence[str], source: str) -> list[
         more = ", ..." if len(dropped) > 1 else ""
         notes.append(f"{source}: {small} below {SMALLEST:g} and left out ({dropped[0]}{more})")
     if driven:
-        vary = counted(len(driven), "heat varies", "heats vary")
+        vary = counted(len(driven), "heat load varies", "heat loads vary")
         more = ", ..." if len(driven) > 1 else ""
-        notes.append(f"{source}: {vary} over time: channels that telemetry must carry ({driven[0]}{more})")
+        notes.append(f"{source}: {vary} with time; telemetry must carry a channel for each ({driven[0]}{more})")
     return notes
 
 

@@ -121,6 +121,12 @@ def held_out_scores(sensors: Sequence[str], predictions: Sequence[Prediction]) -
     return score(sensors, [p.measured_K for p in predictions], [p.predicted_K for p in predictions])
 
 
+def _counts(sensors: Sequence[str], predictions: Sequence[Prediction]) -> dict[str, int]:
+    """Return how many readings of each sensor are scored."""
+    scored = sum(np.isfinite(p.measured_K - p.predicted_K).sum(axis=0) for p in predictions)
+    return dict(zip(sensors, np.broadcast_to(scored, len(sensors)).tolist(), strict=True))
+
+
 def span_json(records: Sequence[Record], counted: int) -> Json:
     """Return start, stop and number of samples of a set of records, times in their own form."""
     first, last = records[0], records[-1]
@@ -266,7 +272,14 @@ def build_report(
         "failures": list(dict.fromkeys(failures)),
         "words": after.summary["words"],
         "notices": [
-            *doubts(before.noise_K, scores[0], scores[1], after.summary["rmse_K"], found=bool(search.findings)),
+            *doubts(
+                before.noise_K,
+                _counts(before.spec.sensors, predictions[0]),
+                scores[0],
+                scores[1],
+                after.summary["rmse_K"],
+                found=bool(search.findings),
+            ),
             *_along_trajectories(search),
             *(attempted(lambda: _beside_gradients(search), "gradients within nodes", failures) or []),
             *_left_out(search),

@@ -1,6 +1,6 @@
 """What the hold-out says against a verdict, in words: it chose nothing, so it may."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from twin_core._typing import Json
 from twin_core.discover.policy import FORESIGHT
@@ -10,13 +10,23 @@ WORSE_THERE = 3.0
 splits it tells of 10 (another room, runs of other kinds than those searched), half of it would tell of 24, twice of 6."""
 
 
-def doubts(noise_K: Mapping[str, float], before: Json, after: Json, training_K: float, *, found: bool) -> list[str]:
+def doubts(
+    noise_K: Mapping[str, float],
+    counts: Mapping[str, int],
+    before: Json,
+    after: Json,
+    training_K: float,
+    *,
+    found: bool,
+) -> list[str]:
     """Return what the errors over the hold-out say against the model, as sentences without full stop.
 
     Parameters
     ----------
     noise_K
         Every declared sensor's noise.
+    counts
+        How many readings of each sensor are scored.
     before, after
         Scores over the hold-out of the declared model and of the corrected one.
     training_K
@@ -25,8 +35,8 @@ def doubts(noise_K: Mapping[str, float], before: Json, after: Json, training_K: 
         Whether anything was added: otherwise both scores are those of the declared model.
     """
     return [
-        *(_in_all(before, after) or _of_each_sensor(noise_K, before, after) if found else ()),
-        *_not_scored(list(noise_K), after),
+        *(_in_all(before, after) or _of_each_sensor(noise_K, counts, before, after) if found else ()),
+        *_not_scored(counts),
         *_differs_there(after, training_K),
     ]
 
@@ -42,20 +52,22 @@ def _in_all(before: Json, after: Json) -> list[str]:
     ]
 
 
-def _of_each_sensor(noise_K: Mapping[str, float], before: Json, after: Json) -> list[str]:
-    """Say at which sensors the error rose by more than chance, and above their noise, though it fell over all of them."""
-    rows = ((name, before["per_sensor"].get(name), row) for name, row in after["per_sensor"].items())
+def _of_each_sensor(noise_K: Mapping[str, float], counts: Mapping[str, int], before: Json, after: Json) -> list[str]:
+    """Say at which sensors the error rose though it fell over all of them: by a share as a finding is asked for, and by more than
+    their noise in the mean square, three standard errors of that of so many readings included."""
+    rows = [(name, row["rmse_K"], after["per_sensor"][name]["rmse_K"]) for name, row in before["per_sensor"].items()]
     return [
-        f"held-out error of {name}: {old['rmse_K']:.3g} K before, {new['rmse_K']:.3g} K after; it rose while the error over all "
-        "sensors fell, so check this sensor and what the model says of its node"
-        for name, old, new in rows
-        if old and FORESIGHT * new["rmse_K"] > old["rmse_K"] and new["rmse_K"] > noise_K[name]
+        f"held-out error of {name}: {old_K:.3g} K before, {new_K:.3g} K after; it rose while the error over all sensors fell, so "
+        "check this sensor and what the model says of its node"
+        for name, old_K, new_K in rows
+        if new_K**2 - old_K**2 > noise_K[name] ** 2 * (1.0 + 3.0 * (2.0 / counts[name]) ** 0.5)
+        and FORESIGHT * new_K > old_K
     ]
 
 
-def _not_scored(sensors: Sequence[str], after: Json) -> list[str]:
+def _not_scored(counts: Mapping[str, int]) -> list[str]:
     """Say which sensors have no reading in the hold-out."""
-    missing = [name for name in sensors if name not in after["per_sensor"]]
+    missing = [name for name, count in counts.items() if count == 0]
     if not missing:
         return []
     have = "has" if len(missing) == 1 else "have"

@@ -104,7 +104,7 @@ def test_doubts_are_counted_instead_of_in_order(
         *doubts, last = capsys.readouterr().out.splitlines()
         assert last == f"{pair_declared['twin']}: {state}; {sizes}"
         assert len(doubts) == (0 if state == "in order" else int(state[0]))
-        assert all(doubt.startswith(f"likely a mistake: {data}: ") for doubt in doubts)
+        assert all(doubt.startswith(f"doubt: {data}: ") for doubt in doubts)
     assert f"{data}: 10 samples in all, too few to determine parameters" in doubts[-1]
     assert main([*argv, "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["doubts"]) == 2

@@ -123,6 +123,10 @@ def test_powers_that_are_all_zero_are_said(powers_W: dict[str, list[float]], sai
     told = nothing_is_heated(load_spec(data), [record])
     assert len(told) == bool(said) and all(line.startswith(said) for line in told)
     assert nothing_is_heated(load_spec(conductive_spec(2, [(0, 1)])), [record]) == []
+    assert resting_channels(load_spec(data), [record])[: len(told)] == told
+    data["channels"]["P1"] = {"kind": "auxiliary"}  # an angle, say: at zero its table may hold any heat
+    data["loads"][1]["table"] = {"knots": [-1.0, 0.0, 1.0]}
+    assert nothing_is_heated(load_spec(data), [record]) == []
 
 
 BOUNDED = positive("C:b", "J/K", 100.0, bounds=(50.0, 200.0))

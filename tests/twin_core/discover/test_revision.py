@@ -31,6 +31,7 @@ from twin_core.discover.judge import (
     OUTDONE,
     SIZE_NOT_DETERMINED,
     SMALL_REMAINDER,
+    SUPERFLUOUS,
     UNDECIDED,
     Finding,
     Judged,
@@ -50,7 +51,7 @@ from twin_core.discover.revision import (
     reconsider,
     tell_alternatives,
     withdraw,
-    withdraw_contradicted,
+    withdraw_superfluous,
 )
 from twin_core.discover.trial import Trial
 from twin_core.effects import REGISTRY
@@ -546,8 +547,15 @@ def test_a_name_is_withdrawn_where_a_far_likelier_one_predicts_no_better(
     assert (state.trial is without) == (not told)
 
 
-FAR_LIKELIER = 60.0 + NEEDED + 0.5 * float(np.log(N_READINGS))
-"""Log-likelihood from which an option with as many parameters is likelier than a finding of 60 nats by the odds asked for."""
+FAR_LIKELIER = 60.0 + NEEDED + FAR
+"""Log-likelihood from which an option with as many parameters is likelier by far than findings of 60 nats."""
+
+
+def with_nats(judged: Judged, nats: float) -> Judged:
+    """Return an option whose trial has a log-likelihood."""
+    stubbed: Any = judged.trial
+    stubbed.nats = nats
+    return judged
 
 
 @pytest.mark.parametrize(
@@ -555,38 +563,67 @@ FAR_LIKELIER = 60.0 + NEEDED + 0.5 * float(np.log(N_READINGS))
     [
         (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", SIZE_NOT_DETERMINED, False),
         (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", NO_FORESIGHT, False),
-        (FAR_LIKELIER, NEEDED, MOST + JUST, "b", SIZE_NOT_DETERMINED, True),
+        (FAR_LIKELIER - JUST, NEEDED, MOST + JUST, "b", SIZE_NOT_DETERMINED, True),
         (FAR_LIKELIER + JUST, NEEDED + JUST, MOST + JUST, "b", SIZE_NOT_DETERMINED, True),
         (FAR_LIKELIER + JUST, NEEDED, MOST, "b", SIZE_NOT_DETERMINED, True),
         (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "a", SIZE_NOT_DETERMINED, True),
         (FAR_LIKELIER + JUST, NEEDED, MOST + JUST, "b", NO_LAW, True),
     ],
-    ids=[
-        "no size",
-        "no foresight",
-        "hardly likelier",
-        "both supported",
-        "coarseness",
-        "holds it itself",
-        "another reason",
-    ],
+    ids=["no size", "no foresight", "less", "both supported", "coarseness", "holds it itself", "another reason"],
 )
-def test_a_name_is_withdrawn_that_a_likelier_option_makes_superfluous(
+def test_a_name_is_withdrawn_that_a_far_likelier_option_makes_superfluous(
     monkeypatch: pytest.MonkeyPatch, nats: float, beside: float, left: float, place: str, reason: str, kept: bool
 ) -> None:
     """A power law of 16 nats, say, where a hidden mass with a lag has 343, of undetermined size: one foretold nothing."""
-    found, option = judged("a", 60.0, left=left), replace(judged(place, nats), reason=reason)
-    for trial, of in ((found.trial, 60.0), (option.trial, nats)):
-        stubbed: Any = trial
-        stubbed.nats = of
-    without = stub()
+    found = with_nats(judged("a", 60.0, left=left), 60.0)
+    option = with_nats(replace(judged(place, nats), reason=reason), nats)
+    without, other = stub(), judged("d", 58.0)
     monkeypatch.setattr(revision, "attempted_without", lambda state, places: (without, 60.0))
     monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
     monkeypatch.setattr(revision, "weigh", lambda simple, rich, n_tried: Evidence(beside, 0.0))
-    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[option])
-    withdraw_contradicted(state, NEEDED)
+    state = Search(found.trial, stub(), findings=[Finding(found, (other,))], rejected=[option])
+    withdraw_superfluous(state, NEEDED)
     assert bool(state.findings) == kept == (state.trial is not without)
-    assert [j.reason for j in state.rejected] == ([reason] if kept else [UNDECIDED] * 2)
+    assert [j.reason for j in state.rejected] == [reason, *([] if kept else [SUPERFLUOUS] * 2)]
+
+
+@pytest.mark.parametrize(
+    "beside", [{"a": 0.0, "c": 0.0}, {"a": 0.0, "c": 9.0}, {"a": 9.0, "c": 0.0}, {"a": 9.0, "c": 9.0}]
+)
+def test_each_name_is_asked_whether_an_option_makes_it_superfluous(
+    monkeypatch: pytest.MonkeyPatch, beside: dict[str, float]
+) -> None:
+    """Two names that imitate a third effect together go together; what is left is examined as before."""
+    names, again = sorted(beside), list[Search]()
+    option = with_nats(replace(judged("b", 500.0), reason=NO_FORESIGHT), 500.0)
+    both = with_nats(replace(judged("a", 60.0), trial=stub(*map(load, names), left=9.0)), 60.0)
+
+    def weighed(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
+        assert simple is option.trial
+        return Evidence(beside[str(rich.effects[-1].where["node"])], 0.0)
+
+    monkeypatch.setattr(revision, "attempted_without", lambda state, places: (stub(), 60.0))
+    monkeypatch.setattr(revision, "try_effects", lambda trial, effects, n_passes: stub(*effects))
+    monkeypatch.setattr(revision, "weigh", weighed)
+    monkeypatch.setattr(revision, "withdraw", lambda state, needed: again.append(state))
+    state = Search(both.trial, stub(), findings=[Finding(judged(n, 60.0)) for n in names], rejected=[option])
+    withdraw_superfluous(state, NEEDED)
+    kept = [name for name in names if beside[name] > NEEDED]
+    assert [f.effects[0].where["node"] for f in state.findings] == kept
+    assert bool(again) == (len(kept) == 1)
+
+
+def test_a_likelihood_that_cannot_be_computed_withdraws_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails() -> float:
+        raise np.linalg.LinAlgError
+
+    found = with_nats(judged("a", 60.0, left=MOST + JUST), 60.0)
+    option: Any = replace(judged("b", 500.0), reason=NO_FORESIGHT)
+    option.trial.log_evidence = fails
+    state = Search(found.trial, stub(), findings=[Finding(found)], rejected=[option])
+    withdraw_superfluous(state, NEEDED)
+    assert [f.judged for f in state.findings] == [found]
+    assert len(state.failures) == 1
 
 
 def test_a_heat_without_a_name_is_not_contradicted_by_a_name(monkeypatch: pytest.MonkeyPatch) -> None:

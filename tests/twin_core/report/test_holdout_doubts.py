@@ -28,7 +28,9 @@ def scores(overall_K: float, **each_K: float) -> Json:
             ["error of T_b: 0.89 K before, 1.51 K"],
         ),
         (scores(2.0, T_a=2.7, T_b=0.05), scores(0.3, T_a=0.3, T_b=0.09), True, 0.3, []),  # within its noise
-        (scores(2.0, T_a=2.7, T_b=0.89), scores(0.7, T_a=0.3, T_b=0.91), True, 0.7, []),  # no more than chance
+        (scores(2.0, T_a=2.7, T_b=0.89), scores(0.7, T_a=0.3, T_b=0.91), True, 0.7, []),  # by two per cent
+        (scores(1.0, T_a=1.4, T_b=0.1), scores(0.1, T_a=0.1, T_b=0.14), True, 0.1, []),  # fits to the noise, by chance
+        (scores(1.0, T_a=1.4, T_b=0.1), scores(0.1, T_a=0.1, T_b=0.19), True, 0.1, ["error of T_b"]),
         (scores(2.0, T_a=2.0), scores(0.5, T_a=0.5), True, 0.5, ["T_b has no usable reading in the hold-out"]),
         (scores(0.5, T_a=0.5), scores(0.5, T_a=0.5), False, 0.5, ["T_b has no usable reading in the hold-out"]),
         (scores(3.1, T_a=3.1, T_b=3.1), scores(3.1, T_a=3.1, T_b=3.1), False, 1.0, ["fits 3 times worse"]),
@@ -37,6 +39,7 @@ def scores(overall_K: float, **each_K: float) -> Json:
     ],
 )
 def test_what_is_said(before: Json, after: Json, training_K: float, said: list[str], *, found: bool) -> None:
-    told = doubts(NOISE_K, before, after, training_K, found=found)
+    counts = {name: 50 if name in after["per_sensor"] else 0 for name in NOISE_K}
+    told = doubts(NOISE_K, counts, before, after, training_K, found=found)
     assert len(told) == len(said)
     assert all(words in line for words, line in zip(said, told, strict=True))

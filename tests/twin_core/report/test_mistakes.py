@@ -99,6 +99,7 @@ def test_that_nothing_is_heated_comes_before_what_may_come_of_it(
 ) -> None:
     base = calibration(np.full((40, 1), 9.0), {"T_1": "a"})
     base.network.spec.loads = [SimpleNamespace(channel="P")]
+    base.network.spec.channels = {"P": SimpleNamespace(kind="power")}
     base.network.parameters = SimpleNamespace(parameters=[])
     base.problem.segments = [SimpleNamespace(record=SimpleNamespace(values={"P": np.full(40, power_W)}))]
     monkeypatch.setattr(mistakes, "stated_guesses", lambda network: {})
