@@ -223,7 +223,7 @@ def _extend(state: Search, needed: float, *, fallback: bool) -> bool:
         return told
 
     def look(fork: Search, seeds: Sequence[Trial], n_together: int) -> tuple[bool, list[Trial]]:
-        known = by_heat.findings[-1].judged.places if told else ()
+        known = by_heat.findings[-1] if told else None
         second = partial(
             extend_by_trajectory, fork, needed, seeds, rankings[-1], n_together, fallback=fallback, known=known
         )

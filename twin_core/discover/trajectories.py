@@ -4,14 +4,15 @@ What long trajectories suggest is weighed as everything else is: against heat th
 that wanders at the sensors.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from math import comb
 
 from twin_core.calibrate.second_order import Calibration
+from twin_core.discover import policy
 from twin_core.discover.evidence import weigh
-from twin_core.discover.judge import Judged, Search, accept, once_each, worth
+from twin_core.discover.judge import Finding, Judged, Search, accept, once_each, worth
 from twin_core.discover.screen import Probe
 from twin_core.discover.shortlist import (
     UNDECLARED_SHARES,
@@ -22,7 +23,7 @@ from twin_core.discover.shortlist import (
     shortlist,
 )
 from twin_core.discover.trial import Trial, about_trajectory, resettled, try_on_trajectories
-from twin_core.effects.base import Effect, Place
+from twin_core.effects.base import Effect
 
 N_REFITS, N_NEAR = 6, 9
 """Effects that are fitted on trajectories: suggested by what these leave, and by what the filter leaves beside little heat."""
@@ -53,7 +54,7 @@ def extend_by_trajectory(
     n_together: int,
     *,
     fallback: bool,
-    known: Collection[Place] = (),
+    known: Finding | None = None,
 ) -> tuple[bool, list[Trial]]:
     """Add the effects that open-loop residuals suggest, one on top of each seed; tell whether one holds, and what comes next.
 
@@ -72,7 +73,8 @@ def extend_by_trajectory(
     fallback
         Whether to try the effects without a name.
     known
-        Places of what is supported by what the innovations suggest: where it is the likeliest here too, it is not examined again.
+        What is supported by what the innovations suggest: where it is the likeliest here too, it is not examined again, and seeds
+        nothing where it leaves less than half of the variance of the error on what it was not fitted to.
 
     Returns
     -------
@@ -96,8 +98,9 @@ def extend_by_trajectory(
     options = [*_settled(state, best[:N_SETTLED], comb(state.n_named, n_together), needed), *best]
     if n_together > 1 and not fallback:
         options = [*_alone(state, best[0]), *options]
-    if min(options, key=worth).places == known:
-        return False, [j.trial for j in sets]
+    if known is not None and min(options, key=worth).places == known.judged.places:
+        foretells = policy.DOMINANCE * known.foresight**2 < 1.0
+        return False, [] if foretells else [j.trial for j in sets]
     state.progress(0.8, "examining candidates")
     return accept(state, options, needed), [j.trial for j in sets]
 

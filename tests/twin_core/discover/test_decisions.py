@@ -457,9 +457,13 @@ def test_what_the_filter_suggests_is_an_option_and_no_seed(monkeypatch: pytest.M
     assert asked == [[by_filter, by_trajectory] if n_together == 1 else [by_trajectory]]
 
 
-@pytest.mark.parametrize("known", ["a", "c"])
+@pytest.mark.parametrize(
+    ("known", "foresight", "seeded"),
+    [("a", DOMINANCE**-0.5 - JUST, False), ("a", DOMINANCE**-0.5, True), ("c", 0.1, True)],
+    ids=["foretells", "foretells little", "another one is likelier"],
+)
 def test_what_is_known_to_hold_is_not_examined_again_but_extended_by_another_one(
-    monkeypatch: pytest.MonkeyPatch, known: str
+    monkeypatch: pytest.MonkeyPatch, known: str, foresight: float, *, seeded: bool
 ) -> None:
     """A power law was the likeliest single effect, held, and no pair was looked for, though 67 times the noise stayed."""
     option, asked, base = judged("a", 50.0), list[object](), stub()
@@ -468,12 +472,12 @@ def test_what_is_known_to_hold_is_not_examined_again_but_extended_by_another_one
     monkeypatch.setattr(trajectories, "_fitted", lambda *arguments, beside_heat: option)
     monkeypatch.setattr(trajectories, "_settled", lambda *arguments: [])
     monkeypatch.setattr(trajectories, "accept", lambda *arguments: asked.append(arguments) or True)
-    place = {load(known).place}
+    finding = Finding(judged(known, 50.0, foresight=foresight))
     told, seeds = trajectories.extend_by_trajectory(
-        Search(base, base, n_named=5), NEEDED, [base], [], 1, fallback=False, known=place
+        Search(base, base, n_named=5), NEEDED, [base], [], 1, fallback=False, known=finding
     )
     assert told == bool(asked) == (known != "a")
-    assert seeds == [option.trial]
+    assert seeds == ([option.trial] if seeded else [])
 
 
 @pytest.mark.parametrize("is_by_heat", [False, True])
