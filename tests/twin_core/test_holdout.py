@@ -81,7 +81,7 @@ def test_too_few_samples_are_refused(n_times: int, fraction: float) -> None:
 
 def test_single_samples_in_files_of_their_own_are_refused() -> None:
     with pytest.raises(
-        TelemetryError, match=r"cannot be split by a hold-out of 0\.3; choose a larger one, or put single"
+        TelemetryError, match=r"cannot be split by a hold-out of 0\.3; choose another one, or put single"
     ):
         split_fraction([steady(1, 60.0 * k, str(k)) for k in range(13)], 0.3)
 
