@@ -55,7 +55,8 @@ def _in_all(before: Json, after: Json) -> list[str]:
 def _of_each_sensor(noise_K: Mapping[str, float], counts: Mapping[str, int], before: Json, after: Json) -> list[str]:
     """Say at which sensors the error rose though it fell over all of them: by a share as a finding is asked for, and by more than
     their noise in the mean square, three standard errors of that of so many readings included."""
-    rows = [(name, row["rmse_K"], after["per_sensor"][name]["rmse_K"]) for name, row in before["per_sensor"].items()]
+    old, new = before["per_sensor"], after["per_sensor"]
+    rows = [(name, old[name]["rmse_K"], new[name]["rmse_K"]) for name in counts if name in old and name in new]
     return [
         f"held-out error of {name}: {old_K:.3g} K before, {new_K:.3g} K after; it rose while the error over all sensors fell, so "
         "check this sensor and what the model says of its node"

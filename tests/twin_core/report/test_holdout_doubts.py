@@ -31,6 +31,7 @@ def scores(overall_K: float, **each_K: float) -> Json:
         (scores(2.0, T_a=2.7, T_b=0.89), scores(0.7, T_a=0.3, T_b=0.91), True, 0.7, []),  # by two per cent
         (scores(1.0, T_a=1.4, T_b=0.1), scores(0.1, T_a=0.1, T_b=0.14), True, 0.1, []),  # fits to the noise, by chance
         (scores(1.0, T_a=1.4, T_b=0.1), scores(0.1, T_a=0.1, T_b=0.19), True, 0.1, ["error of T_b"]),
+        (scores(2.0, T_a=2.7, T_b=0.2), scores(0.5, T_a=0.5), True, 0.5, ["T_b has no"]),  # not predicted any more
         (scores(2.0, T_a=2.0), scores(0.5, T_a=0.5), True, 0.5, ["T_b has no usable reading in the hold-out"]),
         (scores(0.5, T_a=0.5), scores(0.5, T_a=0.5), False, 0.5, ["T_b has no usable reading in the hold-out"]),
         (scores(3.1, T_a=3.1, T_b=3.1), scores(3.1, T_a=3.1, T_b=3.1), False, 1.0, ["fits 3 times worse"]),
