@@ -15,7 +15,6 @@ NOISES = 3.0
 LEAST_BAND = 0.5
 """The dead band in the channel's own unit, where no noise is declared."""
 
-Colour = Literal["yellow", "red"]
 Side = Literal["low", "high"]
 
 

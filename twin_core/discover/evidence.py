@@ -1,6 +1,6 @@
 """Evidence: what the readings say for a trial against a simpler one, and how it predicts what it was not fitted to."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -28,13 +28,10 @@ class Evidence:
         Difference of log evidence (Schwarz), the number of candidates tried counted against it.
     p_value
         Likelihood-ratio test, corrected for the number of candidates (Bonferroni).
-    along_trajectories
-        Whether of open-loop trajectories alone: all that nobody declared then wanders at the sensors.
     """
 
     log_bayes_factor: float
     p_value: float
-    along_trajectories: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,17 +83,7 @@ class Validation:
 def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:
     """Return what the readings say for the rich trial, chosen among ``n_tried``; with ``quick`` what they say at least."""
     after = rich.least_evidence if quick else rich.log_evidence()
-    return _evidence(after - simple.log_evidence(), simple, rich, n_tried)
-
-
-def weigh_trajectories(simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return what the readings say for the rich trial where all that nobody declared wanders at the sensors, not at the nodes."""
-    gain = rich.along_trajectories() - simple.along_trajectories()
-    return replace(_evidence(gain, simple, rich, n_tried), along_trajectories=True)
-
-
-def _evidence(gain: float, simple: Trial, rich: Trial, n_tried: int) -> Evidence:
-    """Return evidence from a gain in log-likelihood, see :func:`paid`."""
+    gain = after - simple.log_evidence()
     p_value = min(1.0, max(n_tried, 1) * float(chdtrc(_n_more(simple, rich), 2.0 * max(gain, 0.0))))
     return Evidence(paid(gain, simple, rich, n_tried), p_value)
 

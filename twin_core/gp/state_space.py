@@ -1,6 +1,6 @@
 """The record of a linear Gaussian state-space model in discrete time, checked once at its door."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -125,12 +125,6 @@ class LinearModel:
         )
         model._check()
         return model
-
-    def with_prior(self, mean: FloatArray, cov: FloatArray) -> Self:
-        """Return the model with another prior of the first state."""
-        changed = replace(self, prior_mean=numbers(mean, "prior_mean"), prior_cov=numbers(cov, "prior_cov"))
-        changed._check()
-        return changed
 
     def observed(self, observations: FloatArray) -> FloatArray:
         """Return observations as contiguous (n_times, n_sensors); ModelError where the shape or an infinity is wrong."""

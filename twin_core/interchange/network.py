@@ -12,9 +12,6 @@ from twin_core.wording import counted
 SMALLEST = 1e-12
 """A coupling that is smaller carries nothing; the specification knows none."""
 
-GIVEN = "given_heat"
-"""The derived channel of 1 W that constant heats are multiples of."""
-
 
 @dataclass
 class Deck:

@@ -38,10 +38,6 @@ class Screening:
             masks[channel] = {reason: mask & heard for reason, mask in reasons.items() if (mask & heard).any()}
         return Screening({channel: reasons for channel, reasons in masks.items() if reasons})
 
-    def reason_at(self, channel: str, row: int) -> str | None:
-        """Return why one sample is no reading, None where it is one."""
-        return next((reason for reason, mask in self.masks.get(channel, {}).items() if mask[row]), None)
-
 
 def screen(
     time_s: FloatArray,

@@ -166,16 +166,6 @@ def _thinned(search: Search) -> list[str]:
     return [f"the record is long: effects were searched on {share}; both models were calibrated on all of them"]
 
 
-def _along_trajectories(search: Search) -> list[str]:
-    """Say which findings open-loop trajectories alone support, so that their evidence is not compared with that of others."""
-    return [
-        f"{finding.judged.labels} is supported by open-loop trajectories alone: beside heat that wanders at the nodes the "
-        "readings do not tell it, and its log Bayes factor is larger than one that allows for such heat"
-        for finding in search.findings
-        if finding.judged.evidence.along_trajectories
-    ]
-
-
 def _beside_gradients(search: Search) -> list[str]:
     """Say where what trajectories leave is what temperature gradients within the nodes would leave: the network is coarse."""
     trial, gradients = search.trial, search.trial.beside_gradients()
@@ -280,7 +270,6 @@ def build_report(
                 after.summary["rmse_K"],
                 found=bool(search.findings),
             ),
-            *_along_trajectories(search),
             *(attempted(lambda: _beside_gradients(search), "gradients within nodes", failures) or []),
             *_left_out(search),
             *_thinned(search),

@@ -33,17 +33,6 @@ def test_what_an_alternative_has_as_well_is_not_in_doubt(monkeypatch: pytest.Mon
     assert told["constant_heat_load"] == [{"effect": "sensor_lag", "where": {"sensor": "T_b"}, "log_bayes_factor": 8.0}]
 
 
-def test_what_trajectories_alone_support_is_said() -> None:
-    """Their evidence is larger than one that allows for heat that wanders at the nodes, so nobody may compare the two."""
-    heat = effect("constant_heat_load", {"node": "b"}, {"Q_W": 2.0})
-    trial: Any = None
-    told = Finding(Judged((heat,), Evidence(9.0, 0.0), trial))
-    alone = Finding(Judged((heat,), Evidence(900.0, 0.0, along_trajectories=True), trial))
-    assert build._along_trajectories(Search(trial, trial, findings=[told])) == []
-    (notice,) = build._along_trajectories(Search(trial, trial, findings=[told, alone]))
-    assert "constant_heat_load(b)" in notice and "trajectories alone" in notice
-
-
 @pytest.mark.parametrize(
     ("left", "beside", "said"),
     [(0.4, 9.0, True), (2.1, 9.0, False), (0.4, 8.0, False), (0.4, None, False)],
