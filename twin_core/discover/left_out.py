@@ -7,9 +7,11 @@ from itertools import pairwise
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.covariance import UNTOLD
+from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Fit, Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
+from twin_core.calibrate.restricted import told_directions
 from twin_core.calibrate.second_order import Calibration, sampling_step_s
 
 N_BLOCKS = 8
@@ -83,21 +85,35 @@ def _blocked_errors(calibration: Calibration, jacobian: FloatArray, noise_K: Flo
         out[first:last] = later[first:last]
         there = _error(problem, problem.solve(unknowns + moves[b], calibration.optimum.fit), out)
         if not abs(there - errors[b]) <= enough:
-            refitted = _predicted(calibration, noise_K, out)
+            refitted = _error(problem, _refitted(calibration, noise_K, out).fit, out)
             errors[b] = refitted if np.isfinite(refitted) else errors[b]
     return errors
 
 
-def _predicted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> float:
-    """Return the error on rows (n_rows, 1) of all segments by a refit to the others beside a noise; infinite where it fails."""
+def _refitted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> Optimum:
+    """Return a refit beside a noise to all but some rows (n_rows, 1) of all segments."""
     problem, optimum = calibration.problem, calibration.optimum
     edges = np.cumsum([segment.measured_K.shape[0] for segment in problem.segments])[:-1]
     kept = tuple(
         replace(segment, measured_K=np.where(rows, np.nan, segment.measured_K))
         for segment, rows in zip(problem.segments, np.split(out, edges), strict=True)
     )
-    refit = minimise(replace(problem, segments=kept, noise_K=noise_K), optimum.unknowns, near=optimum.fit)
-    return np.inf if refit.status == "no_solution" else _error(problem, refit.fit, out)
+    return minimise(replace(problem, segments=kept, noise_K=noise_K), optimum.unknowns, near=optimum.fit)
+
+
+def _expected(problem: Problem, refit: Optimum, lasting_K: FloatArray, out: BoolArray) -> float:
+    """Return the sum of squared weighted errors on rows (n_rows, 1) that follows from what a refit to the others leaves open.
+
+    The variance of its predictions by the delta method, beside the noise that lasts, whatever noise the fit was made beside.
+    """
+    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(refit.unknowns, refit.fit))
+    seen = np.isfinite(np.concatenate([segment.measured_K for segment in problem.segments]))
+    told_by, asked = jacobian[seen & ~out], jacobian[seen & out]
+    sensors = np.broadcast_to(np.arange(lasting_K.size), seen.shape)
+    told_by = told_by / lasting_K[sensors[seen & ~out]][:, None]
+    asked = asked / problem.noise_K[sensors[seen & out]][:, None]
+    hessian = told_by.T @ told_by + np.diag(problem.prior()[1] ** -2.0)
+    return float(((asked @ told_directions(hessian, UNTOLD)) ** 2).sum())
 
 
 def _noises_K(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
@@ -125,6 +141,9 @@ def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
 def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatArray:
     """Return the open-loop error over what a refit has not seen; infinite where a refit fails, zero where nothing is left.
 
+    The error that is made, or the one to be expected from what the refit leaves open, whichever is larger: a forecast that comes
+    true by chance foretells nothing, and beside it one that is right to a little more than the noise would count as worse.
+
     Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
     Of a single one the end is predicted by a fit to the beginning, up to a while after ``event_s`` on the clock of
     ``Record.clock_s``: nothing foretells an event that has not begun.
@@ -134,13 +153,16 @@ def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatAr
     (2,)
         By refits beside the sensors' own noise, and beside the noise that lasts.
     """
-    folds = [np.concatenate(fold) for fold in _folds(calibration.problem.segments, event_s)]
-    return np.array(
-        [
-            sum(_predicted(calibration, noise_K, fold) for fold in folds if fold.any())
-            for noise_K in _noises_K(calibration)
-        ]
-    )
+    problem, noises_K = calibration.problem, _noises_K(calibration)
+    folds = [np.concatenate(fold) for fold in _folds(problem.segments, event_s)]
+
+    def error(noise_K: FloatArray, out: BoolArray) -> float:
+        refit = _refitted(calibration, noise_K, out)
+        if not np.isfinite(refit.fit.cost):
+            return np.inf
+        return max(_error(problem, refit.fit, out), _expected(problem, refit, noises_K[1], out))
+
+    return np.array([sum(error(noise_K, fold) for fold in folds if fold.any()) for noise_K in noises_K])
 
 
 def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.calibrate.optimise import minimise
+from twin_core.calibrate.optimise import Optimum, minimise
+from twin_core.calibrate.problem import Fit
 from twin_core.calibrate.second_order import Calibration, fit_network
 from twin_core.discover import left_out
 from twin_core.discover.left_out import N_BLOCKS, OPENING_SHARE, blocked_errors, forward_error
@@ -76,12 +77,12 @@ def test_what_one_block_alone_tells_is_refitted(
 ) -> None:
     calibration, calls = calibrated(power_W()), []
 
-    def counted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> float:
+    def counted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> Optimum:
         calls.append(out)
-        return predicted(calibration, noise_K, out)
+        return refit(calibration, noise_K, out)
 
-    predicted = left_out._predicted
-    monkeypatch.setattr(left_out, "_predicted", counted)
+    refit = left_out._refitted
+    monkeypatch.setattr(left_out, "_refitted", counted)
     found, expected = blocked_errors(calibration)[0], refitted(calibration)
     assert len(calls) == 2 * n_refits  # beside either noise
     assert np.abs(found - expected).max() <= 0.03 * expected.sum()
@@ -102,7 +103,8 @@ def test_a_bound_that_is_far_away_changes_nothing(monkeypatch: pytest.MonkeyPatc
 
 def test_a_refit_that_fails_leaves_the_linear_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     calibration = calibrated(held_but_once())
-    monkeypatch.setattr(left_out, "_predicted", lambda calibration, noise_K, out: np.inf)
+    nowhere = replace(calibration.optimum, fit=Fit(np.inf, (), ()), status="no_solution")
+    monkeypatch.setattr(left_out, "_refitted", lambda calibration, noise_K, out: nowhere)
     failed = blocked_errors(calibration)
     monkeypatch.setattr(left_out, "MISJUDGED", np.inf)
     assert np.isfinite(failed).all()
@@ -126,6 +128,33 @@ def test_a_misfit_that_lasts_carries_no_refit_away() -> None:
     as_if_white, own = np.transpose([forward_error(case) for case in cases])
     assert np.mean(own) < np.mean(as_if_white)
     assert np.std(np.log(own)) < np.std(np.log(as_if_white)) / 3.0
+
+
+def test_a_forecast_that_comes_true_by_chance_foretells_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The beginning tells no capacity: a refit that happens to be right there could have been as wrong as any other."""
+    power = np.where((TIME_S >= 0.80 * TIME_S[-1]) & (TIME_S < 0.85 * TIME_S[-1]), 30.0, 10.0)
+    untold, told = calibrated(power), calibrated(swinging())
+    monkeypatch.setattr(left_out, "_error", lambda problem, fit, out: float(out.sum()))  # as right as the noise allows
+    n_left_out = N - int((1.0 - left_out.FORWARD_SHARE) * N)
+    assert (forward_error(untold) > 100.0 * n_left_out).all()
+    np.testing.assert_array_equal(forward_error(told), n_left_out)
+
+
+def test_the_error_to_be_expected_is_that_of_many_draws() -> None:
+    """Against refits to readings drawn anew: what the beginning leaves open is what predictions of the end differ by."""
+    calibration = calibrated(swinging())
+    problem, (segment,) = calibration.problem, calibration.problem.segments
+    out = np.arange(N)[:, None] >= int((1.0 - left_out.FORWARD_SHARE) * N)
+    exact = calibration.optimum.fit.predicted_K[0]
+    rng, errors = np.random.default_rng(5), []
+    for _ in range(200):
+        drawn = replace(segment, measured_K=exact + problem.noise_K * rng.standard_normal(exact.shape))
+        refit = left_out._refitted(
+            replace(calibration, problem=replace(problem, segments=(drawn,))), problem.noise_K, out
+        )
+        errors.append(float((((refit.fit.predicted_K[0] - exact) / problem.noise_K)[out] ** 2).sum()))
+    refit = left_out._refitted(calibration, problem.noise_K, out)
+    assert left_out._expected(problem, refit, problem.noise_K, out) == pytest.approx(np.mean(errors), rel=0.25)
 
 
 @pytest.mark.parametrize(
