@@ -47,7 +47,8 @@ class Validation:
         Share of blocks whose error fell.
     forward_ratio
         The same for the end of the training record after a refit to its beginning, or where there are several segments
-        for each after a refit to the others: does the effect extrapolate?
+        for each after a refit to the others: does the effect extrapolate? No error counts as smaller than the one
+        where the refit was made, reading by reading.
     removed_share
         Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
     explained_share

@@ -7,11 +7,9 @@ from itertools import pairwise
 import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
-from twin_core.calibrate.covariance import UNTOLD
 from twin_core.calibrate.optimise import Optimum, minimise
 from twin_core.calibrate.problem import Fit, Problem, Segment
 from twin_core.calibrate.residual_noise import stacked_jacobian
-from twin_core.calibrate.restricted import told_directions
 from twin_core.calibrate.second_order import Calibration, sampling_step_s
 
 N_BLOCKS = 8
@@ -101,21 +99,6 @@ def _refitted(calibration: Calibration, noise_K: FloatArray, out: BoolArray) -> 
     return minimise(replace(problem, segments=kept, noise_K=noise_K), optimum.unknowns, near=optimum.fit)
 
 
-def _expected(problem: Problem, refit: Optimum, lasting_K: FloatArray, out: BoolArray) -> float:
-    """Return the sum of squared weighted errors on rows (n_rows, 1) that follows from what a refit to the others leaves open.
-
-    The variance of its predictions by the delta method, beside the noise that lasts, whatever noise the fit was made beside.
-    """
-    jacobian = stacked_jacobian(problem, problem.jacobian_blocks(refit.unknowns, refit.fit))
-    seen = np.isfinite(np.concatenate([segment.measured_K for segment in problem.segments]))
-    told_by, asked = jacobian[seen & ~out], jacobian[seen & out]
-    sensors = np.broadcast_to(np.arange(lasting_K.size), seen.shape)
-    told_by = told_by / lasting_K[sensors[seen & ~out]][:, None]
-    asked = asked / problem.noise_K[sensors[seen & out]][:, None]
-    hessian = told_by.T @ told_by + np.diag(problem.prior()[1] ** -2.0)
-    return float(((asked @ told_directions(hessian, UNTOLD)) ** 2).sum())
-
-
 def _noises_K(calibration: Calibration) -> tuple[FloatArray, FloatArray]:
     """Return each sensor's own noise, and no less than it what its residual amounts to in the long run, (n_sensors,) both.
 
@@ -141,8 +124,8 @@ def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
 def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatArray:
     """Return the open-loop error over what a refit has not seen; infinite where a refit fails, zero where nothing is left.
 
-    The error that is made, or the one to be expected from what the refit leaves open, whichever is larger: a forecast that comes
-    true by chance foretells nothing, and beside it one that is right to a little more than the noise would count as worse.
+    No less than a refit misses, reading by reading, where it was fitted: a forecast that is better than the fit was lucky, and
+    beside it another one that is right to a little more than the noise would count as worse.
 
     Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
     Of a single one the end is predicted by a fit to the beginning, up to a while after ``event_s`` on the clock of
@@ -155,12 +138,12 @@ def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatAr
     """
     problem, noises_K = calibration.problem, _noises_K(calibration)
     folds = [np.concatenate(fold) for fold in _folds(problem.segments, event_s)]
+    seen = np.isfinite(np.concatenate([segment.measured_K for segment in problem.segments]))
 
     def error(noise_K: FloatArray, out: BoolArray) -> float:
         refit = _refitted(calibration, noise_K, out)
-        if not np.isfinite(refit.fit.cost):
-            return np.inf
-        return max(_error(problem, refit.fit, out), _expected(problem, refit, noises_K[1], out))
+        n_out, n_kept = (seen & out).sum(), (seen & ~out).sum()
+        return max(_error(problem, refit.fit, out), _error(problem, refit.fit, ~out) * float(n_out / max(n_kept, 1)))
 
     return np.array([sum(error(noise_K, fold) for fold in folds if fold.any()) for noise_K in noises_K])
 
