@@ -47,8 +47,8 @@ class Validation:
         Share of blocks whose error fell.
     forward_ratio
         The same for the end of the training record after a refit to its beginning, or where there are several segments
-        for each after a refit to the others: does the effect extrapolate? No error counts as smaller than the one
-        where the refit was made, reading by reading.
+        for each after a refit to the others: does the effect extrapolate? An error that grows counts so far as it
+        is larger than any coarse network's.
     removed_share
         Misfit that the effect removes from the training record, as a share of the temperatures' spread (rms).
     explained_share
@@ -151,13 +151,17 @@ def _last_instant(simple: Trial, rich: Trial) -> float | None:
 def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
     """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
 
-    An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size.
+    An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size. What any
+    coarse network may miss is not held against the rich trial: where all is at rest, a simple one may be right by chance to a
+    fraction of that.
     """
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
         before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
-    return _rms_ratio(before, after) if before.any() else 1.0
+    if not before.any():
+        return 1.0
+    return _rms_ratio(np.maximum(before, np.minimum(after, 1.0 + policy.MOST_COARSENESS)), after)
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

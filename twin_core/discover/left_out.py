@@ -124,9 +124,6 @@ def _error(problem: Problem, fit: Fit, out: BoolArray) -> float:
 def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatArray:
     """Return the open-loop error over what a refit has not seen; infinite where a refit fails, zero where nothing is left.
 
-    No less than a refit misses, reading by reading, where it was fitted: a forecast that is better than the fit was lucky, and
-    beside it another one that is right to a little more than the noise would count as worse.
-
     Segments are sessions: each is predicted by a fit to the others, because what changes between sessions is no physics.
     Of a single one the end is predicted by a fit to the beginning, up to a while after ``event_s`` on the clock of
     ``Record.clock_s``: nothing foretells an event that has not begun.
@@ -134,18 +131,20 @@ def forward_error(calibration: Calibration, event_s: float = -np.inf) -> FloatAr
     Returns
     -------
     (2,)
-        By refits beside the sensors' own noise, and beside the noise that lasts.
+        Mean square of the readings, each in units of its noise, by refits beside the sensors' own noise, and beside the noise
+        that lasts.
     """
-    problem, noises_K = calibration.problem, _noises_K(calibration)
+    problem = calibration.problem
     folds = [np.concatenate(fold) for fold in _folds(problem.segments, event_s)]
     seen = np.isfinite(np.concatenate([segment.measured_K for segment in problem.segments]))
-
-    def error(noise_K: FloatArray, out: BoolArray) -> float:
-        refit = _refitted(calibration, noise_K, out)
-        n_out, n_kept = (seen & out).sum(), (seen & ~out).sum()
-        return max(_error(problem, refit.fit, out), _error(problem, refit.fit, ~out) * float(n_out / max(n_kept, 1)))
-
-    return np.array([sum(error(noise_K, fold) for fold in folds if fold.any()) for noise_K in noises_K])
+    n_readings = max(sum(int((seen & fold).sum()) for fold in folds), 1)
+    return np.array(
+        [
+            sum(_error(problem, _refitted(calibration, noise_K, fold).fit, fold) for fold in folds if fold.any())
+            / n_readings
+            for noise_K in _noises_K(calibration)
+        ]
+    )
 
 
 def _folds(segments: Sequence[Segment], event_s: float) -> list[list[BoolArray]]:

@@ -237,7 +237,7 @@ def test_an_instant_is_paid_for_as_one_among_all_samples() -> None:
         step = REGISTRY["heat_load_step"]({"node": "n1"}, {"Q_W": 1.0, "time": 0.4}, clock)
         simple, rich = stub(n_free=3), stub(step, n_free=5)
         simple, rich = replace(simple, n_samples=n), replace(rich, n_samples=n)
-        excess.append(evidence_module._evidence(float(gains.max()), simple, rich, 1).log_bayes_factor - exact)
+        excess.append(evidence_module.paid(float(gains.max()), simple, rich, 1) - exact)
     assert np.ptp(excess) < 1.5 and np.abs(excess).max() < 3.0
 
 
@@ -270,9 +270,23 @@ def test_where_refits_differ_the_less_favourable_one_counts(
     monkeypatch.setattr(
         Trial, "block_errors", lambda own: (np.full(2, 4.0) if own is base else after)[:, None] * np.ones((2, N_BLOCKS))
     )
-    monkeypatch.setattr(Trial, "forward_error", lambda own: np.full(2, 4.0) if own is base else after)
+    monkeypatch.setattr(Trial, "forward_error", lambda own: np.full(2, 40.0) if own is base else 10.0 * after)
     validation = validate(base, right)
     assert (validation.ratio, validation.forward_ratio, validation.blocks_better) == (1.5, 1.5, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "ratio"),
+    [(1.8, 4.9, 1.0), (1.8, 20.0, 2.0), (40.0, 90.0, 1.5), (4.0, 1.0, 0.5), (90.0, 4.0, 2.0 / np.sqrt(90.0))],
+    ids=["as any coarse network", "beyond it", "both beyond it", "better within it", "better"],
+)
+def test_what_any_coarse_network_may_miss_is_not_held_against_what_follows(
+    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch, before: float, after: float, ratio: float
+) -> None:
+    """Mean squares in units of the noise, of which a coarse network leaves up to 1 + 4."""
+    base, right = trials
+    monkeypatch.setattr(Trial, "forward_error", lambda own: np.full(2, before if own is base else after))
+    assert validate(base, right).forward_ratio == pytest.approx(ratio)
 
 
 def test_a_correction_is_validated_as_it_is_handed_out(
