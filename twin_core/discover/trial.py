@@ -91,7 +91,7 @@ class Trial:
 
     @once
     def forward_error(self) -> FloatArray:
-        """Sum of squared weighted errors over parts of the training record that a refit has not seen, by two refits, (2,)."""
+        """Mean square of errors on training readings that a refit has not seen, in units of the noise, by two refits, (2,)."""
         return forward_error(self.calibration())
 
     @once
