@@ -269,9 +269,11 @@ def _probes(
         gained = np.where(seen, np.einsum("eij,ei->ej", directions, along[at] / scale) / root, 0.0)
         amounts = np.einsum("eij,ej->ei", directions, gained / root) / scale
         for e, candidate in enumerate(which.tolist()):
-            moved = effects[candidate].with_amplitudes(amounts[e]) if seen[e].any() else None
+            start, largest = effects[candidate], float(np.max(np.abs(amounts[e])))
+            share = min(1.0, start.linear_up_to / max(largest, 1e-300))
+            moved = start.with_amplitudes(share * amounts[e]) if seen[e].any() else None
             if moved is not None:
-                found.append(Probe(effects[candidate], moved, 0.5 * float(gained[e] @ gained[e])))
+                found.append(Probe(start, moved, share * (1.0 - 0.5 * share) * float(gained[e] @ gained[e])))
     return found
 
 

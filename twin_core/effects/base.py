@@ -330,6 +330,11 @@ class Effect(ABC):
         """Positions of the parameters that scale the effect (those with a null value)."""
         return tuple(i for i, q in enumerate(self.parameter_specs()) if q.null is not None)
 
+    @property
+    def linear_up_to(self) -> float:
+        """The distance of an amplitude from null up to which the response to it is that of :meth:`unit_heats`; mostly any."""
+        return np.inf
+
     def with_values(self, values: Mapping[str, float]) -> Self:
         """Return the effect with some of its values replaced (short names)."""
         return replace(self, values={**self.values, **values})

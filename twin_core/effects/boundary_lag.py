@@ -10,6 +10,7 @@ from twin_core._typing import FloatArray
 from twin_core.effects.base import Effect, ParameterSpec, Survey, Where
 from twin_core.effects.boundaries import boundary_places, changed_boundary, heat_of_change
 from twin_core.effects.hidden_mass import first_order_lag
+from twin_core.effects.sensor_lag import SCALED_UP_TO
 from twin_core.network.model import Addition, ExtraNode, Layout
 from twin_core.network.terms import Along, Entry, Heat, Sink
 from twin_core.parameters.parameter import Parameter, positive
@@ -97,6 +98,11 @@ class BoundaryLag(Effect):
         longest = max(float(time_s[s][-1] - time_s[s][0]) for s in survey.segments())
         for tau in np.geomspace(shortest, max(longest, 2.0 * shortest), N_TIME_CONSTANTS):
             yield cls(where, {"tau_s": 0.0}, {"start_s": float(tau)})
+
+    @property
+    def linear_up_to(self) -> float:
+        """The time constant to which the response at the assumed one can be scaled: nearly that of the next start."""
+        return SCALED_UP_TO * float(self.settings["start_s"])
 
     def unit_heats(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
         """Return the heat per second of lag, at the lag that this start assumes."""

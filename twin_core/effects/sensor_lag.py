@@ -15,6 +15,10 @@ from twin_core.parameters.parameter import Parameter, positive
 
 N_TIME_CONSTANTS = 6
 
+SCALED_UP_TO = 2.0
+"""So many times the assumed time constant of a lag its response may be scaled to: a longer one saturates, and the next start,
+nearly three times as long, tells it better."""
+
 
 @dataclass(frozen=True)
 class Lag:
@@ -74,6 +78,11 @@ class SensorLag(Effect):
         sampling = float(np.median(steps[steps > 0]))
         for tau in np.geomspace(0.5 * sampling, 100.0 * sampling, N_TIME_CONSTANTS):
             yield cls(where, {"tau_s": 0.0}, {"start_s": float(tau)})
+
+    @property
+    def linear_up_to(self) -> float:
+        """The time constant to which the response at the assumed one can be scaled: nearly that of the next start."""
+        return SCALED_UP_TO * float(self.settings["start_s"])
 
     def unit_readings(self, survey: Survey) -> list[list[tuple[int, FloatArray]]]:
         """Return the change of the reading per second of lag, at the lag that this start assumes."""
