@@ -91,11 +91,11 @@ def add_coarse_alternatives(state: Search, simple: Trial, finding: Finding, need
         *((effect, starts_beside_gradients(simple)) for effect in beside),
     ]
     best = _best_of_each_place(state, simple, finding, options, least, goal)
-    as_screened = {effect.place: effect for effect, _ in reversed(options)}
+    as_screened = {effect.place: effect for effect in reversed(near)}
     told = state.attempt_each(
         [
             (
-                partial(_supported, state, simple, t, as_screened[t.effects[-1].place], needed),
+                partial(_supported, state, simple, t, as_screened.get(t.effects[-1].place), needed),
                 f"{t.effects[-1].label} instead of {own.label}",
             )
             for t in best
@@ -221,16 +221,16 @@ def _explaining(
     return trial if likely or explained(simple, trial, found) >= least else None
 
 
-def _supported(state: Search, simple: Trial, trial: Trial, start: Effect, needed: float) -> Judged | None:
+def _supported(state: Search, simple: Trial, trial: Trial, start: Effect | None, needed: float) -> Judged | None:
     """Return the last effect of a trial that was fitted on trajectories if the readings support it.
 
     Near what was found, the parameters make room for that, and another name may be caught at a time constant of minutes in place
-    of seconds: it is fitted from ``start`` and the simpler model as it was fitted too. The undeclared heat beside it is a first
-    guess, while the simpler model's was fitted: where that speaks against the effect, it is fitted too.
+    of seconds: it is fitted from its ``start`` there and the simpler model as it was fitted too. The undeclared heat beside it is
+    a first guess, while the simpler model's was fitted: where that speaks against the effect, it is fitted too.
     """
-    other = try_on_trajectories(simple, (*simple.present_effects, start))
-    if other is not None and other.log_evidence() > trial.log_evidence():
-        trial = other
+    if start is not None:
+        other = try_on_trajectories(simple, (*simple.present_effects, start), simple.calibration())
+        trial = max(filter(None, (trial, other)), key=lambda t: t.log_evidence())
     n_tried, found = max(state.n_named, 1), trial
     evidence = weigh(simple, found, n_tried)
     for refit, least in ((resettled_near, -np.inf), (resettled, needed - HOPELESS_NATS)):

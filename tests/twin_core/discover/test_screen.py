@@ -127,6 +127,30 @@ def test_a_late_reading_is_the_lag_of_its_node() -> None:
         np.testing.assert_allclose(tau * block[5:, :, 0], change[5:], atol=0.1 * scale)
 
 
+def test_a_lag_starts_at_a_length_that_its_response_can_have() -> None:
+    """The change per second of a short lag, scaled to a long one, told of 275 s in place of 19 s."""
+    p = problem()
+    lag = REGISTRY["sensor_lag"]({"sensor": "T_a"}, {"tau_s": 900.0})
+    read = [
+        after + s.measured_K - before
+        for after, before, s in zip(readings_with(p, [lag]), readings_with(p, []), p.segments, strict=True)
+    ]
+    fit = fit_of(replace(p, segments=tuple(replace(s, measured_K=r) for s, r in zip(p.segments, read, strict=True))))
+    survey = survey_of(fit)
+    starts = list(REGISTRY["sensor_lag"].starts({"sensor": "T_a"}, survey))
+    probes = screen(fit, survey, starts).probes
+    found, residual = projected_responses(fit, survey, [probe.start for probe in probes])
+    assert probes[0].effect.values["tau_s"] == pytest.approx(900.0, rel=0.4)
+    scaled = 0
+    for probe, response in zip(probes, found, strict=True):
+        tau_s = probe.effect.values["tau_s"]
+        assert tau_s <= 2.0 * probe.start.settings["start_s"] * (1.0 + 1e-12)
+        left = residual - response[:, 0] * tau_s  # the gain is what the lag gains at that length
+        assert probe.gain == pytest.approx(0.5 * float(residual @ residual - left @ left), rel=1e-6)
+        scaled += np.linalg.lstsq(response, residual, rcond=None)[0][0] > tau_s * 1.001
+    assert scaled
+
+
 def test_a_late_sink_is_the_lag_of_its_channel() -> None:
     p = problem()
     fit = fit_of(p)
