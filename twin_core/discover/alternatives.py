@@ -225,12 +225,14 @@ def _supported(state: Search, simple: Trial, trial: Trial, start: Effect | None,
     """Return the last effect of a trial that was fitted on trajectories if the readings support it.
 
     Near what was found, the parameters make room for that, and another name may be caught at a time constant of minutes in place
-    of seconds: it is fitted from its ``start`` there and the simpler model as it was fitted too. The undeclared heat beside it is
-    a first guess, while the simpler model's was fitted: where that speaks against the effect, it is fitted too.
+    of seconds: it is fitted from its ``start`` there and the simpler model as it was fitted too, and the closer fit counts. The
+    undeclared heat beside it is a first guess, while the simpler model's was fitted: where that speaks against the effect, it is
+    fitted too.
     """
     if start is not None:
-        other = try_on_trajectories(simple, (*simple.present_effects, start), simple.calibration())
-        trial = max(filter(None, (trial, other)), key=lambda t: t.log_evidence())
+        reached = trial.near[0].fit.cost
+        other = try_on_trajectories(simple, (*simple.present_effects, start), simple.calibration(), goal=reached)
+        trial = trial if other is None or other.near[0].fit.cost >= reached else other
     n_tried, found = max(state.n_named, 1), trial
     evidence = weigh(simple, found, n_tried)
     for refit, least in ((resettled_near, -np.inf), (resettled, needed - HOPELESS_NATS)):

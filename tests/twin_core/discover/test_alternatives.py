@@ -17,7 +17,7 @@ from twin_core.discover.policy import ALTERNATIVE_NATS, LARGEST_NOISE, REPEATABL
 from twin_core.discover.trial import Trial, explained
 from twin_core.effects.base import Effect
 
-BEFORE, LEFT = 10.0, 2.0
+BEFORE, LEFT, COST = 10.0, 2.0, 1e3
 MOST_LEFT = LEFT + REPEATABLE_SHARE * (BEFORE - LEFT)
 
 
@@ -58,12 +58,13 @@ class Fits:
         made: Any = stub(load("b"), left=left)
         made.nats = nats
         made.log_evidence = lambda: self.likelier
-        made.near, made.least_evidence = (SimpleNamespace(status=self.status),), self.least
+        optimum = SimpleNamespace(status=self.status, fit=SimpleNamespace(cost=COST))
+        made.near, made.least_evidence = (optimum,), self.least
         return made
 
-    def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any, goal: float = np.inf) -> Any:
+    def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any, goal: float) -> Any:
         self.tries.append(starts)
-        if goal == np.inf:  # what explains enough, fitted from the simpler model as it was fitted
+        if goal == COST:  # what explains enough, fitted from the simpler model as it was fitted
             return self.again
         return self.trial(min(self.rough[str(start)] for start in starts), self.fine[0])
 
@@ -116,15 +117,15 @@ def test_a_place_as_likely_as_what_was_found_is_not_fitted_from_its_other_starts
     assert fits.tries == tries
 
 
-@pytest.mark.parametrize(("more", "told"), [(JUST, ["b"]), (-JUST, [])], ids=["likelier", "less likely"])
-def test_an_alternative_is_fitted_from_the_simpler_model_too_and_the_likelier_fit_is_weighed(
+@pytest.mark.parametrize(("more", "told"), [(-JUST, ["b"]), (JUST, [])], ids=["closer", "less close"])
+def test_an_alternative_is_fitted_from_the_simpler_model_too_and_the_closer_fit_is_weighed(
     monkeypatch: pytest.MonkeyPatch, more: float, told: list[str]
 ) -> None:
     """A sensor's lag of 19 s ended at 154 s from where a heater had been found, 70 nats below."""
     fits = Fits(monkeypatch, (LEFT, LEFT), (-133.0, -133.0))
     fits.near = -133.0
     fits.again = fits.trial(LEFT, NEEDED + JUST)
-    fits.again.log_evidence = lambda: fits.likelier + more
+    fits.again.near[0].fit.cost = COST + more
     assert fits.told() == told
 
 
