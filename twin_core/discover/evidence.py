@@ -73,12 +73,13 @@ class Validation:
 
         A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
         them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
-        their geometric mean counts, and twice more what makes one of them worse.
+        their geometric mean counts. What makes one of them worse counts twice more.
         """
+        worse = max(1.0, self.ratio, self.forward_ratio) ** 2
         if self.n_sessions > 1 and self.is_law:
             is_told_by_all = 1.0 - self.forward_ratio >= policy.BETWEEN_SESSIONS * (1.0 - self.ratio)
-            return self.forward_ratio if is_told_by_all else 1.0
-        return float(np.sqrt(self.ratio * self.forward_ratio)) * max(1.0, self.ratio, self.forward_ratio) ** 2
+            return self.forward_ratio * worse if is_told_by_all else worse
+        return float(np.sqrt(self.ratio * self.forward_ratio)) * worse
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:

@@ -72,6 +72,7 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
         (0.5, 0.7, 3, True, 0.7),
         (0.5, 0.75, 3, True, 0.75),
         (0.5, 0.75 + JUST, 3, True, 1.0),
+        (1.2, 0.9, 3, True, 1.2**2 * 0.9),
         (0.5, 0.9, 3, False, np.sqrt(0.45)),
     ],
     ids=[
@@ -83,6 +84,7 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
         "told between sessions",
         "half of the gain",
         "less than half",
+        "worse within sessions",
         "event, sessions",
     ],
 )
