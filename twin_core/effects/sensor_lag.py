@@ -16,8 +16,9 @@ from twin_core.parameters.parameter import Parameter, positive
 N_TIME_CONSTANTS = 6
 
 SCALED_UP_TO = 2.0
-"""So many times the assumed time constant of a lag its response may be scaled to: a longer one saturates, and the next start,
-nearly three times as long, tells it better."""
+"""So many times the assumed time constant of a lag its response may be scaled to, a ratio: a longer one saturates, and the next
+start, nearly three times as long, tells it better. A run of the temperature lab is told alike with half and twice as much, and
+not at all without it."""
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,15 @@ def readings_with(p: Problem, effects: list[Effect]) -> list[np.ndarray]:
     return found
 
 
+def read_with(p: Problem, effect: Effect) -> Problem:
+    """Return a problem whose readings hold an effect too."""
+    read = [
+        after + s.measured_K - before
+        for after, before, s in zip(readings_with(p, [effect]), readings_with(p, []), p.segments, strict=True)
+    ]
+    return replace(p, segments=tuple(replace(s, measured_K=r) for s, r in zip(p.segments, read, strict=True)))
+
+
 APPROXIMATE = {"hidden_mass": 0.05}
 """A mass is screened as the lag of its node from the first stage on, not from the start itself."""
 LINEAR = [name for name in REGISTRY if name not in ("sensor_lag", "boundary_lag")]  # a lag is screened at its own size
@@ -131,11 +140,7 @@ def test_a_lag_starts_at_a_length_that_its_response_can_have() -> None:
     """The change per second of a short lag, scaled to a long one, told of 275 s in place of 19 s."""
     p = problem()
     lag = REGISTRY["sensor_lag"]({"sensor": "T_a"}, {"tau_s": 900.0})
-    read = [
-        after + s.measured_K - before
-        for after, before, s in zip(readings_with(p, [lag]), readings_with(p, []), p.segments, strict=True)
-    ]
-    fit = fit_of(replace(p, segments=tuple(replace(s, measured_K=r) for s, r in zip(p.segments, read, strict=True))))
+    fit = fit_of(read_with(p, lag))
     survey = survey_of(fit)
     starts = list(REGISTRY["sensor_lag"].starts({"sensor": "T_a"}, survey))
     probes = screen(fit, survey, starts).probes
@@ -177,12 +182,7 @@ def test_the_gain_is_that_of_least_squares() -> None:
     """What a candidate adds to the log-likelihood: half the fall of the squared residual when it joins the parameters."""
     p = problem()
     truth = REGISTRY["input_gain"]({"channel": "Q_a"}, {"g": 1.3})
-    read = [
-        after + s.measured_K - before
-        for after, before, s in zip(readings_with(p, [truth]), readings_with(p, []), p.segments, strict=True)
-    ]
-    p = replace(p, segments=tuple(replace(s, measured_K=r) for s, r in zip(p.segments, read, strict=True)))
-    fit = fit_of(p)
+    fit = fit_of(read_with(p, truth))
     survey = survey_of(fit)
     candidates = [
         REGISTRY["input_gain"]({"channel": "Q_sun"}, {"g": 1.0}),
