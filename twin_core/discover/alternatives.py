@@ -11,6 +11,7 @@ from itertools import chain
 
 import numpy as np
 
+from twin_core.calibrate.containment import attempted
 from twin_core.calibrate.second_order import Calibration
 from twin_core.discover import policy
 from twin_core.discover.evidence import weigh
@@ -231,7 +232,10 @@ def _supported(state: Search, simple: Trial, trial: Trial, start: Effect | None,
     """
     if start is not None:
         reached = trial.near[0].fit.cost
-        other = try_on_trajectories(simple, (*simple.present_effects, start), simple.calibration(), goal=reached)
+        again = partial(
+            try_on_trajectories, simple, (*simple.present_effects, start), simple.calibration(), goal=reached
+        )
+        other = attempted(again, "the same from the simpler model", [])  # its failure takes nothing from the first fit
         trial = trial if other is None or other.near[0].fit.cost >= reached else other
     n_tried, found = max(state.n_named, 1), trial
     evidence = weigh(simple, found, n_tried)

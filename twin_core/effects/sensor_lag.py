@@ -17,8 +17,8 @@ N_TIME_CONSTANTS = 6
 
 SCALED_UP_TO = 2.0
 """So many times the assumed time constant of a lag its response may be scaled to, a ratio: a longer one saturates, and the next
-start, nearly three times as long, tells it better. A run of the temperature lab is told alike with half and twice as much, and
-not at all without it."""
+start, mostly two to three times as long, tells it better. A run of the temperature lab is told alike with half and twice as
+much, and not at all without it."""
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,8 @@ class Fits:
     def tried(self, simple: Trial, effects: tuple[Effect, ...], *starts: Any, goal: float) -> Any:
         self.tries.append(starts)
         if goal == COST:  # what explains enough, fitted from the simpler model as it was fitted
+            if isinstance(self.again, Exception):
+                raise self.again
             return self.again
         return self.trial(min(self.rough[str(start)] for start in starts), self.fine[0])
 
@@ -127,6 +129,12 @@ def test_an_alternative_is_fitted_from_the_simpler_model_too_and_the_closer_fit_
     fits.again = fits.trial(LEFT, NEEDED + JUST)
     fits.again.near[0].fit.cost = COST + more
     assert fits.told() == told
+
+
+def test_a_failure_from_the_simpler_model_takes_nothing_from_the_first_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    fits = Fits(monkeypatch, (LEFT, LEFT), (9.0, 9.0))
+    fits.again = np.linalg.LinAlgError("singular matrix")
+    assert fits.told() == ["b"]
 
 
 @pytest.mark.parametrize(
