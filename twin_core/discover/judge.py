@@ -15,7 +15,7 @@ from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import at_an_end, coinciding_channel
 from twin_core.discover.evidence import Evidence, Validation, validate
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
-from twin_core.discover.trial import Trial, by_chance, explained
+from twin_core.discover.trial import Trial, by_chance, explained, mean_excess
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
 from twin_core.errors import ModelError
@@ -360,12 +360,13 @@ def _hardly_shows(simple: Trial, trial: Trial, removed: float) -> bool:
 def _little(simple: Trial, trial: Trial, removed: float) -> float:
     """Return up to what variance a repeatable heat beside a name is little, in units of the sensors' noise.
 
-    That is a share of what the name removes, and no more than a coarse network may leave, or than as large a share of what stays
-    beside either: where a model misses so much else, a law is not told wrong by less.
+    That is a share of what the name removes, and no more than the network is seen to leave beside either, beyond chance, and any
+    coarse one may, or than as large a share of what stays: where a model misses so much else, a law is not told wrong by less.
     """
-    stays = trial.unexplained() - removed
+    taken = removed + by_chance(trial.n_samples)
+    coarse, stays = min(policy.MOST_COARSENESS, mean_excess(trial) - taken), trial.unexplained() - taken
     share = policy.REPEATABLE_SHARE
-    return min(share * explained(simple, trial), max(policy.MOST_COARSENESS, share * stays))
+    return min(share * explained(simple, trial), max(coarse, share * stays))
 
 
 def most_left(log_bayes_factor: float, needed: float) -> float:
