@@ -72,14 +72,16 @@ class Validation:
         """Error on what the effects were not fitted to, after over before (rms).
 
         A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
-        them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
-        their geometric mean counts. What makes one of them worse counts twice more.
+        them is what differs between sessions. Of a single one the geometric mean of blocks and the end counts, but what blocks
+        gain only as far as the end does: an effect must last, while parts of the same days may be alike by chance. An event of
+        one session is not told by the others. What makes one of them worse counts twice more.
         """
         worse = max(1.0, self.ratio, self.forward_ratio) ** 2
         if self.n_sessions > 1 and self.is_law:
             is_told_by_all = 1.0 - self.forward_ratio >= policy.BETWEEN_SESSIONS * (1.0 - self.ratio)
             return self.forward_ratio * worse if is_told_by_all else worse
-        return float(np.sqrt(self.ratio * self.forward_ratio)) * worse
+        blocks = self.ratio if self.n_sessions > 1 else max(self.ratio, self.forward_ratio)
+        return float(np.sqrt(blocks * self.forward_ratio)) * worse
 
 
 def weigh(simple: Trial, rich: Trial, n_tried: int, *, quick: bool = False) -> Evidence:

@@ -15,6 +15,10 @@ from twin_core.parameters.parameter import Parameter
 EXPONENTS = (1.25, 1.5, 2.0)
 """Laminar natural convection, what lies between, and flow that the difference itself drives."""
 
+STEEPEST = 4.0
+"""No convection is steeper; nucleate boiling, with an exponent of about three, comes nearest. What switches, as a fan does, would
+take any exponent, and such a law runs away wherever the difference grows a little beyond what the record visits."""
+
 ROUNDING_K = 0.01
 """Below this difference the heat is linear in it, so that the slope is bounded for any exponent."""
 
@@ -59,7 +63,7 @@ class NonlinearConvection(Effect):
         """Return coefficient and exponent."""
         return (
             ParameterSpec("k", "W/K^p", null=0.0, positive=True),
-            ParameterSpec("p", "", positive=True, prior_std=0.5),
+            ParameterSpec("p", "", positive=True, prior_std=0.5, upper=STEEPEST),
         )
 
     def addition(self, layout: Layout) -> Addition:

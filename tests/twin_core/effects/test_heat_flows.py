@@ -9,6 +9,7 @@ import pytest
 from tests.analytic import SIGMA
 from tests.helpers import every_term_network, points, survey_of
 from twin_core.effects import REGISTRY, Effect
+from twin_core.effects.nonlinear_convection import STEEPEST
 from twin_core.errors import ModelError
 from twin_core.network.terms import Along
 
@@ -60,6 +61,15 @@ def test_nonlinear_convection(p: float) -> None:
     found = heat_W(REGISTRY["nonlinear_convection"]({"node": "c", "boundary": "room"}, {"k": 0.4, "p": p}))
     np.testing.assert_allclose(found[:, 2], 0.4 * np.array([5.0, 35.0, 35.0]) ** p, rtol=5e-6)
     np.testing.assert_array_equal(found[:, :2], 0.0)
+
+
+def test_no_convection_is_steeper_than_any_known() -> None:
+    """What switches, as a fan does, took an exponent of 63 on a measured inverter, and ran away on the hold-out."""
+    found = REGISTRY["nonlinear_convection"]({"node": "c", "boundary": "room"}, {"k": 0.4, "p": 1.25})
+    transform = {spec.name: spec.transform for spec in found.parameter_specs()}["p"]
+    assert transform.highest == pytest.approx(math.log(STEEPEST))
+    for p in (1.0, 1.33, 3.0):
+        assert transform.to_value(transform.to_free(p)) == pytest.approx(p)
 
 
 def test_nonlinear_convection_is_odd_and_its_slope_bounded() -> None:
