@@ -57,6 +57,8 @@ class Validation:
         Segments of the training record.
     is_law
         Whether no effect is an event at an instant.
+    forward_at_best
+        ``forward_ratio`` if all that any coarse network may leave there were no fault of the effects.
     """
 
     ratio: float
@@ -66,21 +68,23 @@ class Validation:
     explained_share: float
     n_sessions: int = 1
     is_law: bool = True
+    forward_at_best: float = 0.0
 
     @property
     def foresight(self) -> float:
         """Error on what the effects were not fitted to, after over before (rms).
 
         A law holds in every session, so each is predicted from the others; what gains much less there than on blocks within
-        them is what differs between sessions. Of a single one the geometric mean of blocks and the end counts, but what blocks
-        gain only as far as the end does: an effect must last, while parts of the same days may be alike by chance. An event of
-        one session is not told by the others. What makes one of them worse counts twice more.
+        them is what differs between sessions. Of a single one, or of an event, blocks and the end may each see little:
+        their geometric mean counts, but what blocks of a single one gain only as far as its end may gain, give or take
+        coarseness: an effect lasts, while parts of the same days may be alike by chance. What makes one of them worse counts
+        twice more.
         """
         worse = max(1.0, self.ratio, self.forward_ratio) ** 2
         if self.n_sessions > 1 and self.is_law:
             is_told_by_all = 1.0 - self.forward_ratio >= policy.BETWEEN_SESSIONS * (1.0 - self.ratio)
             return self.forward_ratio * worse if is_told_by_all else worse
-        blocks = self.ratio if self.n_sessions > 1 else max(self.ratio, self.forward_ratio)
+        blocks = self.ratio if self.n_sessions > 1 else max(self.ratio, self.forward_at_best)
         return float(np.sqrt(blocks * self.forward_ratio)) * worse
 
 
@@ -125,12 +129,12 @@ def validate(simple: Trial, rich: Trial) -> Validation:
     before, after = simple.block_errors(), rich.block_errors()
     where_fitted = float(np.sqrt(np.nansum(misfits[1] ** 2) / max(np.nansum(misfits[0] ** 2), 1e-300)))
     ratio = max(_rms_ratio(before.sum(axis=1), after.sum(axis=1)), where_fitted)
-    forward = _forward_ratio(simple, rich, instant)
+    forward, at_best = _forward_ratios(simple, rich, instant)
     better = float(np.mean((after < before).all(axis=0)))
     explained = explained_share(simple.fit, rich.fit)
     n_sessions = len(rich.fit.problem.segments)
     is_law = all(q.instant is None for effect in rich.effects for q in effect.parameter_specs())
-    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law)
+    return Validation(ratio, better, forward, _removed_share(simple, rich), explained, n_sessions, is_law, at_best)
 
 
 def _rms_ratio(before: FloatArray, after: FloatArray) -> float:
@@ -151,20 +155,22 @@ def _last_instant(simple: Trial, rich: Trial) -> float | None:
     return max(instants, default=None)
 
 
-def _forward_ratio(simple: Trial, rich: Trial, instant: float | None) -> float:
-    """Return the error on what follows, after over before (rms); one where the last event leaves nothing that follows it.
+def _forward_ratios(simple: Trial, rich: Trial, instant: float | None) -> tuple[float, float]:
+    """Return the error on what follows, after over before (rms), and what it is at best; one and zero where nothing follows.
 
     An event is asked about what follows it: where it comes at the end of what a fit has seen, nothing tells its size. What any
     coarse network may miss is not held against the rich trial: where all is at rest, a simple one may be right by chance to a
-    fraction of that.
+    fraction of that. At best all of it is no fault of the rich trial's.
     """
     if instant is None:
         before, after = simple.forward_error(), rich.forward_error()
     else:
         before, after = side_by_side([partial(forward_error, t.calibration(), instant) for t in (simple, rich)])
     if not before.any():
-        return 1.0
-    return _rms_ratio(np.maximum(before, np.minimum(after, 1.0 + policy.MOST_COARSENESS)), after)
+        return 1.0, 0.0
+    coarse = policy.MOST_COARSENESS
+    ratio = _rms_ratio(np.maximum(before, np.minimum(after, 1.0 + coarse)), after)
+    return ratio, _rms_ratio(before, np.maximum(after - coarse, 0.0))
 
 
 def explained_share(simple: HeatFit, rich: HeatFit) -> float:

@@ -76,9 +76,9 @@ THRESHOLDS: dict[str, Threshold] = {
     "MOST_COARSENESS": Threshold(
         NOISE_VARIANCE,
         "what stays beyond it is no coarseness, and is not held against a name unless a far likelier option was refused,"
-        " nor is an error up to it on what follows, however small it is without the name; of what gradients"
-        " explain only the like share is theirs where more stays, and no more than it without a name unless as much with it; a"
-        " repeatable heat that leaves more is not little unless so much else stays",
+        " nor is an error up to it on what follows, however small it is without the name, nor a gain there that it may hide; of"
+        " what gradients explain only the like share is theirs where more stays, and no more than it without a name unless as"
+        " much with it; a repeatable heat that leaves more is not little unless so much else stays",
         "a misfit of two noises",
         1e12,
         2.0,

@@ -62,29 +62,29 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "forward", "n_sessions", "is_law", "foresight"),
+    ("ratio", "forward", "at_best", "n_sessions", "is_law", "foresight"),
     [
-        (0.5, 0.5, 1, True, 0.5),
-        (0.64, 0.25, 1, True, 0.4),
-        (0.64, 0.25, 1, False, 0.4),
-        (0.25, 0.64, 1, True, 0.64),
-        (0.25, 1.0, 1, True, 1.0),
-        (0.25, 1.0, 1, False, 1.0),
-        (0.25, 2.0, 1, True, 2.0**2 * 2.0),
-        (1.44, 0.25, 1, False, 1.44**2 * 0.6),
-        (0.5, 0.7, 3, True, 0.7),
-        (0.5, 0.75, 3, True, 0.75),
-        (0.5, 0.75 + JUST, 3, True, 1.0),
-        (1.2, 0.9, 3, True, 1.2**2 * 0.9),
-        (0.5, 0.9, 3, False, np.sqrt(0.45)),
+        (0.5, 0.5, 0.4, 1, True, 0.5),
+        (0.25, 1.0, 0.0, 1, True, 0.5),
+        (0.25, 1.0, 0.0, 1, False, 0.5),
+        (0.25, 0.64, 0.36, 1, True, 0.48),
+        (0.25, 1.0, 1.0, 1, False, 1.0),
+        (0.64, 0.25, 0.2, 1, False, 0.4),
+        (0.25, 2.0, 1.0, 1, True, 2.0**2 * np.sqrt(2.0)),
+        (1.44, 0.25, 0.2, 1, False, 1.44**2 * 0.6),
+        (0.5, 0.7, 0.7, 3, True, 0.7),
+        (0.5, 0.75, 0.75, 3, True, 0.75),
+        (0.5, 0.75 + JUST, 0.75, 3, True, 1.0),
+        (1.2, 0.9, 0.9, 3, True, 1.2**2 * 0.9),
+        (0.5, 0.9, 0.9, 3, False, np.sqrt(0.45)),
     ],
     ids=[
         "alike",
         "geometric mean",
-        "an event",
-        "blocks gain more than the end",
-        "blocks alone",
-        "an event, blocks alone",
+        "an event at rest",
+        "blocks gain more than the end can",
+        "an event of blocks alone",
+        "the end gains more",
         "worse at the end",
         "worse on blocks",
         "told between sessions",
@@ -94,8 +94,10 @@ def test_the_odds_of_the_false_alarm_rate_are_asked_for(rate: float) -> None:
         "event, sessions",
     ],
 )
-def test_foresight(ratio: float, forward: float, n_sessions: int, is_law: bool, foresight: float) -> None:
-    told = Validation(ratio, 1.0, forward, 0.1, 1.0, n_sessions, is_law)
+def test_foresight(
+    ratio: float, forward: float, at_best: float, n_sessions: int, is_law: bool, foresight: float
+) -> None:
+    told = Validation(ratio, 1.0, forward, 0.1, 1.0, n_sessions, is_law, at_best)
     assert told.foresight == pytest.approx(foresight)
 
 

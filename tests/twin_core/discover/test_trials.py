@@ -276,17 +276,31 @@ def test_where_refits_differ_the_less_favourable_one_counts(
 
 
 @pytest.mark.parametrize(
-    ("before", "after", "ratio"),
-    [(1.8, 4.9, 1.0), (1.8, 20.0, 2.0), (40.0, 90.0, 1.5), (4.0, 1.0, 0.5), (90.0, 4.0, 2.0 / np.sqrt(90.0))],
-    ids=["as any coarse network", "beyond it", "both beyond it", "better within it", "better"],
+    ("before", "after", "ratio", "at_best"),
+    [
+        (1.8, 4.9, 1.0, np.sqrt(0.5)),
+        (1.8, 20.0, 2.0, np.sqrt(16.0 / 1.8)),
+        (40.0, 90.0, 1.5, np.sqrt(86.0 / 40.0)),
+        (4.0, 1.0, 0.5, 0.0),
+        (90.0, 4.0, 2.0 / np.sqrt(90.0), 0.0),
+        (200.0, 200.0, 1.0, np.sqrt(0.98)),
+    ],
+    ids=["as any coarse network", "beyond it", "both beyond it", "better within it", "better", "far beyond it"],
 )
 def test_what_any_coarse_network_may_miss_is_not_held_against_what_follows(
-    trials: tuple[Trial, Trial], monkeypatch: pytest.MonkeyPatch, before: float, after: float, ratio: float
+    trials: tuple[Trial, Trial],
+    monkeypatch: pytest.MonkeyPatch,
+    before: float,
+    after: float,
+    ratio: float,
+    at_best: float,
 ) -> None:
     """Mean squares in units of the noise, of which a coarse network leaves up to 1 + 4."""
     base, right = trials
     monkeypatch.setattr(Trial, "forward_error", lambda own: np.full(2, before if own is base else after))
-    assert validate(base, right).forward_ratio == pytest.approx(ratio)
+    validation = validate(base, right)
+    assert validation.forward_ratio == pytest.approx(ratio)
+    assert validation.forward_at_best == pytest.approx(at_best)
 
 
 def test_a_correction_is_validated_as_it_is_handed_out(
