@@ -172,10 +172,18 @@ def resident_MiB(process: int) -> float:
     What they share counts once where the system tells it (proportional set size), else for each of them.
     """
     folder = Path("/proc", str(process))
-    forked = [int(child) for told in folder.glob("task/*/children") for child in _text(told).split()]
+    forked = [int(child) for thread in _threads(folder) for child in _text(thread / "children").split()]
     memory = _text(folder / "smaps_rollup") or _text(folder / "status")
     found = re.search(r"^(?:Pss|VmRSS):\s+(\d+) kB", memory, re.MULTILINE)
     return (int(found[1]) / 1024 if found else 0.0) + sum(map(resident_MiB, forked))
+
+
+def _threads(folder: Path) -> list[Path]:
+    """Return the folders of a process's threads; none where it has ended, which it may do while it is asked."""
+    try:
+        return list((folder / "task").iterdir())
+    except OSError:
+        return []
 
 
 def _text(path: Path) -> str:

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -50,6 +51,22 @@ def test_the_memory_of_a_process_is_known_on_any_linux(monkeypatch: pytest.Monke
     held = np.ones(50 * 2**17)
     assert resident_MiB(os.getpid()) > held.nbytes / 2**20
     assert resident_MiB(2**22 + 1) == 0.0  # nobody's number
+
+
+def test_a_process_may_end_while_its_memory_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that was forked from a job ended between two looks at its folder, and took the job with it."""
+
+    def gone(told: Callable[..., Any]) -> Callable[..., Any]:
+        def look(path: Any) -> Any:
+            if os.fspath(path).endswith("/task"):
+                raise FileNotFoundError(2, "No such file or directory", os.fspath(path))
+            return told(path)
+
+        return look
+
+    for name in ("scandir", "listdir"):
+        monkeypatch.setattr(os, name, gone(getattr(os, name)))
+    assert resident_MiB(os.getpid()) > 0.0
 
 
 @pytest.mark.skipif(not side_by_side.CAN_FORK, reason="this system does not fork safely")
