@@ -17,7 +17,8 @@ EXPONENTS = (1.25, 1.5, 2.0)
 
 STEEPEST = 4.0
 """No convection is steeper; nucleate boiling, with an exponent of about three, comes nearest. What switches, as a fan does, would
-take any exponent, and such a law runs away wherever the difference grows a little beyond what the record visits."""
+take any exponent, and such a law runs away wherever the difference grows a little beyond what the record visits. A measured
+inverter with a fan was predicted at 28.5 K without a limit, and at 1.9, 2.0 and 1.4 K with one of 3, 4 and 8."""
 
 ROUNDING_K = 0.01
 """Below this difference the heat is linear in it, so that the slope is bounded for any exponent."""
