@@ -125,8 +125,12 @@ def temperature_lab(train: Iterable[str], predict: Iterable[str], folder: Path) 
 
 
 def published(words: str) -> Callable[[Path], str]:
-    """Return a reference that is told in words."""
-    return lambda folder: words
+    """Return a reference that is told in words; it can be sent between processes."""
+    return partial(_told, words)
+
+
+def _told(words: str, folder: Path) -> str:
+    return words
 
 
 def _lab(name: str, train: Sequence[str], predict: Sequence[str], others: str, every_pair: bool = False) -> Split:

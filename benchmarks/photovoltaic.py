@@ -20,8 +20,9 @@ import pandas as pd
 
 from benchmarks.markdown import save_table
 from benchmarks.measured_run import THREADS, Result, compile_all, measure, sources, supervised
-from benchmarks.measured_splits import Prepared, Split
+from benchmarks.measured_splits import Prepared, Split, published
 from benchmarks.measured_table import in_one_line, main_table
+from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
@@ -29,8 +30,8 @@ TITLE = "Closed loop on photovoltaic arrays, held-out rmse"
 DEADLINE_S = 180.0
 HELD_OUT = (0.2, 0.3, 0.4, 0.5)
 LEGEND = (
-    "`before` is the declared model at its best, `after` the one with what was found; both are open-loop rollouts. The days that"
-    " are held out are colder and partly snowed over: no training part tells of them."
+    "`before` is the declared model at its best, `after` the one with what was found; both are open-loop rollouts. Snow"
+    " falls on a part of what is held out, of which no training part tells."
 )
 
 COLUMNS = {
@@ -118,9 +119,9 @@ def read(path: Path, channels: Sequence[str]) -> Record:
     table = pd.read_csv(path, index_col=0)
     instants = pd.to_datetime(table.index).to_numpy().astype("datetime64[ns]").astype(np.int64)
     own = COLUMNS[path.name]
-    zero_C = 273.15
     values = {
-        name: table[own[name]].to_numpy(dtype=float) + (zero_C if name.startswith("T_") else 0.0) for name in channels
+        name: table[own[name]].to_numpy(dtype=float) + (ZERO_CELSIUS_K if name.startswith("T_") else 0.0)
+        for name in channels
     }
     return Record((instants - instants[0]) / 1e9, values, int(instants[0]), path.stem)
 
@@ -131,13 +132,8 @@ def prepared(device: str, share: float, folder: Path) -> Prepared:
     return Prepared(load_spec(declared), [read(folder / file, list(declared["channels"]))], holdout=share)
 
 
-def no_reference(folder: Path) -> str:
-    """Return what others reach: nobody has told."""
-    return ""
-
-
 SPLITS = tuple(
-    Split(f"{device}: the last {share:.0%} held out", ".", partial(prepared, device, share), no_reference)
+    Split(f"{device}: the last {share:.0%} held out", ".", partial(prepared, device, share), published(""))
     for device in DEVICES
     for share in HELD_OUT
 )
@@ -165,7 +161,12 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="searches at a time")
     given = parser.parse_args(words)
     os.environ.update(dict.fromkeys(THREADS, "1"))  # the processes that are started below inherit it
+    absent = [name for name in COLUMNS if not (given.data / name).is_file()]
+    if absent:
+        parser.error(f"--data: {given.data} lacks {', '.join(absent)}")
     splits = [s for s in SPLITS if any(word.lower() in s.name.lower() for word in given.only)]
+    if not splits:
+        parser.error(f"--only: no split has {' or '.join(given.only)} in its name")
     code = sources()
     compile_all()
 
