@@ -86,7 +86,7 @@ def _carrying(effect: Effect, free_names: Sequence[str], covariance: FloatArray 
     """Return an effect with the covariance of its own parameters, where there is one."""
     if covariance is None:
         return effect
-    own = [free_names.index(p.name) for p in effect.parameters()]
+    own = [free_names.index(p.name) for p in effect.parameters() if not p.frozen]
     return effect.learned(covariance[np.ix_(own, own)])
 
 

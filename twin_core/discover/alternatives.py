@@ -143,8 +143,8 @@ def _near(simple: Trial, start: Calibration, found: Calibration, own: Effect, kn
     """Return the names that linear screening about the trajectories found puts first, at the simpler model's parameters."""
     about = about_trajectory(start.problem, start.optimum, found)
     screening = screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0]
-    most = len(own.parameter_specs())
-    probes = [p for p in screening.probes if p.effect.place not in known and len(p.effect.parameter_specs()) <= most]
+    most = own.n_free
+    probes = [p for p in screening.probes if p.effect.place not in known and p.effect.n_free <= most]
     near = [probe.effect for probe in best_of_each_place(probes, simple.n_samples)[:N_COMPARED]]
     here = acts_at(simple, (own,))
     varied = [
@@ -165,9 +165,7 @@ def _near_before(simple: Trial, own: Effect, known: Collection[Place]) -> list[E
     for about in (simple.fit, about_trajectory(calibration.problem, calibration.optimum)):
         screening = screened(simple, about, UNDECLARED_SHARES[-1:], fallback=False)[0]
         probes = best_of_each_place(screening.probes, simple.n_samples)
-        gains = {
-            p.effect.place: p.gain for p in probes if len(p.effect.parameter_specs()) <= len(own.parameter_specs())
-        }
+        gains = {p.effect.place: p.gain for p in probes if p.effect.n_free <= own.n_free}
         least = (1.0 - policy.REPEATABLE_SHARE) * gains.get(own.place, 0.0)
         others = [p.effect for p in probes if p.effect.place not in known and gains.get(p.effect.place, -1.0) >= least]
         chosen += refined(about, others[:N_BEFORE])
@@ -180,12 +178,9 @@ def _near_beside_gradients(simple: Trial, own: Effect, known: Collection[Place])
     if screened_there is None:
         return []
     about, screenings = screened_there
-    most = len(own.parameter_specs())
+    most = own.n_free
     rankings = [best_of_each_place(screening.probes, simple.n_samples) for screening in screenings]
-    others = [
-        [p for p in ranked if p.effect.place not in known and len(p.effect.parameter_specs()) <= most]
-        for ranked in rankings
-    ]
+    others = [[p for p in ranked if p.effect.place not in known and p.effect.n_free <= most] for ranked in rankings]
     return refined(about, shortlist(others, 0.0, N_BESIDE_GRADIENTS))
 
 

@@ -54,9 +54,10 @@ def _exchanged(state: Search, own: Effect, needed: float) -> bool:
     state.rejected = [j for j in state.rejected if j.effects != best.effects]
     state.rejected.append(replace(told, reason=OUTDONE))
     state.findings = [
-        _renamed(f, own, examined, best.evidence.log_bayes_factor - lost) if f is finding else f for f in state.findings
+        _renamed(f, own, examined, examined.evidence.log_bayes_factor - lost) if f is finding else f
+        for f in state.findings
     ]
-    state.trial = best.trial
+    state.trial = examined.trial
     return True
 
 
@@ -73,13 +74,13 @@ def _renamed(finding: Finding, own: Effect, examined: Judged, more: float) -> Fi
 def _rivals(without: Trial, own: Effect) -> list[Effect]:
     """Return the best other names for an effect, with no more parameters, that act where it does on top of a trial without it."""
     survey, effects = candidates(without, without.fit, fallback=False)
-    here, most = acts_at(without, (own,)), len(own.parameter_specs())
+    here, most = acts_at(without, (own,)), own.n_free
     acting = {place: acts_at(without, (effect,)) for place, effect in {e.place: e for e in effects}.items()}
     effects = [
         effect
         for effect in effects
         if effect.place != own.place
-        and len(effect.parameter_specs()) <= most
+        and effect.n_free <= most
         and (acting[effect.place] == here if here else effect.where == own.where)
     ]
     screenings = screen_sizes(without.fit, UNDECLARED_SHARES, survey, effects)

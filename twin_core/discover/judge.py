@@ -13,8 +13,9 @@ from twin_core.calibrate.containment import NO_DEADLINE, TimeIsUpError, attempte
 from twin_core.discover import policy
 from twin_core.discover.coarseness import stands
 from twin_core.discover.coincidence import at_an_end, coinciding_channel
-from twin_core.discover.evidence import Evidence, Validation, validate
+from twin_core.discover.evidence import Evidence, Validation, validate, weigh
 from twin_core.discover.form import acts_at, against_free_forms, more_is_left_elsewhere
+from twin_core.discover.spare import without_spare
 from twin_core.discover.trial import Trial, by_chance, explained, mean_excess
 from twin_core.discover.wald import least_wald_score, score_needed
 from twin_core.effects.base import Effect, Place
@@ -292,7 +293,8 @@ def _examined(
     simple = state.trial
 
     def apart(option: Judged) -> tuple[tuple[Judged, bool], dict[str, Any]]:
-        return examine(simple, option, needed), known(option.trial)
+        examined = examine(simple, option, needed)
+        return examined, known(examined[0].trial)
 
     with state.attempts_ahead([(partial(apart, j), j.labels) for j in options[1:]]) as told:
 
@@ -301,7 +303,7 @@ def _examined(
                 examined = state.attempt(partial(examine, simple, options[0], needed), options[0].labels)
             else:
                 examined, learnt = told(i - 1) or (None, {})
-                keep(options[i].trial, learnt)
+                keep(options[i].trial if examined is None else examined[0].trial, learnt)
             return examined or (replace(options[i], reason=NOT_EXAMINED), False)
 
         yield result
@@ -310,8 +312,10 @@ def _examined(
 def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
 
-    A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
+    It is examined, and returned, without what the readings do not speak for. A correction is handed out as trajectories: one
+    that wandering heat alone supports must not make these less likely.
     """
+    judged = _without_spare(simple, judged)
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
     if least_wald_score(simple, judged.trial) < score_needed(needed):
@@ -325,6 +329,17 @@ def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]
         return replace(judged, validation=validation, reason=NO_FORESIGHT), False
     reason = _merely_resembles(simple, judged, needed)
     return replace(judged, validation=validation, reason=reason), bool(reason)
+
+
+def _without_spare(simple: Trial, judged: Judged) -> Judged:
+    """Return an option with the amplitudes only that the readings pay for."""
+    trial = without_spare(simple, judged.trial)
+    if trial is judged.trial:
+        return judged
+    places = judged.places
+    effects = tuple(effect for effect in trial.effects if effect.place in places)
+    gained = judged.evidence.log_bayes_factor - weigh(trial, judged.trial, 1).log_bayes_factor
+    return replace(judged, effects=effects, evidence=replace(judged.evidence, log_bayes_factor=gained), trial=trial)
 
 
 def _merely_resembles(simple: Trial, judged: Judged, needed: float) -> str:
@@ -399,7 +414,7 @@ def complexity(judged: Judged) -> tuple[int, int]:
     joined = {end for conductor in spec.conductors for end in conductor.between}
     radiated_to = {radiator.sink for radiator in spec.radiators} - joined
     by_matter = [e for e in judged.effects if "node" in e.where and e.where.get("boundary") in radiated_to]
-    return sum(len(effect.parameter_specs()) for effect in judged.effects), len(by_matter)
+    return sum(effect.n_free for effect in judged.effects), len(by_matter)
 
 
 def foresight_of(judged: Judged) -> float:

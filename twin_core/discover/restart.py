@@ -38,8 +38,10 @@ def _restarted(state: Search, own: Effect) -> Trial | None:
     start = bare(without, found)
     about = about_trajectory(start.problem, start.optimum, found)
     survey = survey_of(about)
-    most = len(own.parameter_specs())  # of more parameters each would have to be paid for
-    settings = [e for e in type(own).starts(own.where, survey) if len(e.parameter_specs()) <= most]
+    most = own.n_free  # of more parameters each would have to be paid for
+    starts = type(own).starts(own.where, survey)
+    forms = [form for e in starts for form in (e.simplified(survey) if own.held else (e,))]
+    settings = [form for form in forms if form.n_free <= most]
     probes = screen(about, survey, settings).probes if len(settings) > 1 else ()
     likely = each_start([p.effect for p in probes if p.gain >= LEAST_GAIN_SHARE * probes[0].gain])[:N_STARTS]
 

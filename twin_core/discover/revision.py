@@ -214,6 +214,7 @@ def _examine_again(state: Search, places: Collection[object], needed: float, *, 
     predicts = own.reason == NO_FORESIGHT and foresight_of(own) < foresight
     if predicts or own.reason in ("", SMALL_REMAINDER):
         again = replace(finding, judged=replace(own, reason=""))
+        state.trial = own.trial
         state.findings = [again if f is finding else f for f in state.findings]
         return
     state.rejected.append(own)
@@ -246,7 +247,7 @@ def _in_place_of(
     state.rejected = [j for j in state.rejected if j.effects != option.effects]
     state.rejected.append(replace(finding.judged, reason=OUTDONE))
     state.findings = [Finding(examined) if f is finding else f for f in state.findings]
-    state.trial = trial
+    state.trial = examined.trial
     return examined
 
 
@@ -416,7 +417,7 @@ def _refitted(effects: Sequence[Effect], state: Search) -> Trial:
 
 def _forms(effects: Sequence[Effect]) -> frozenset[object]:
     """Return what effects are and where, and with how many parameters."""
-    return frozenset((effect.place, len(effect.parameter_specs())) for effect in effects)
+    return frozenset((effect.place, effect.n_free) for effect in effects)
 
 
 def _without_each(state: Search, sets: Collection[frozenset[object]]) -> dict[frozenset[object], Without | None]:

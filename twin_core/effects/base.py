@@ -270,6 +270,10 @@ class Effect(ABC):
         """Yield the effect with what it may also have and its simplest form lacks, such as an end; most have no more."""
         return ()
 
+    def simplified(self, survey: Survey) -> Iterable[Self]:
+        """Yield the fitted effect with an amplitude held that readings may not speak for; most can spare none."""
+        return ()
+
     def centred(self, survey: Survey) -> Self:
         """Return the fitted effect with what the record leaves open put in the middle; most leave nothing open."""
         return self
@@ -279,7 +283,7 @@ class Effect(ABC):
         return ()
 
     def learned(self, covariance: FloatArray) -> Self:
-        """Return the effect with the covariance of its parameters in the solver's coordinate, where it carries it."""
+        """Return the effect with the covariance of its free parameters in the solver's coordinate, where it carries it."""
         return self
 
     def beyond(self, layout: Layout, along: Along) -> Beyond | None:
@@ -315,9 +319,30 @@ class Effect(ABC):
     def parameters(self) -> tuple[Parameter, ...]:
         """Return the effect's parameters under their full names."""
         return tuple(
-            Parameter(f"{self.label}.{q.name}", q.unit, float(self.values[q.name]), q.transform, q.prior_std)
+            Parameter(
+                f"{self.label}.{q.name}",
+                q.unit,
+                float(self.values[q.name]),
+                q.transform,
+                q.prior_std,
+                frozen=q.name in self.held,
+            )
             for q in self.parameter_specs()
         )
+
+    @property
+    def held(self) -> tuple[str, ...]:
+        """Names of the values that are held, and no unknowns of a fit."""
+        return tuple(self.settings.get("held", ()))
+
+    @property
+    def n_free(self) -> int:
+        """How many values a fit may move."""
+        return len(self.parameter_specs()) - len(self.held)
+
+    def holding(self, name: str) -> Self:
+        """Return the effect with one more value held where it is."""
+        return replace(self, settings={**self.settings, "held": (*self.held, name)})
 
     def presented(self, spec: ParameterSpec) -> float | str:
         """Return a value as people read it: an instant in the telemetry's own form, to the millisecond where dated."""
@@ -327,8 +352,8 @@ class Effect(ABC):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Positions of the parameters that scale the effect (those with a null value)."""
-        return tuple(i for i, q in enumerate(self.parameter_specs()) if q.null is not None)
+        """Positions of the parameters that scale the effect (those with a null value) and are not held."""
+        return tuple(i for i, q in enumerate(self.parameter_specs()) if q.null is not None and q.name not in self.held)
 
     @property
     def linear_up_to(self) -> float:

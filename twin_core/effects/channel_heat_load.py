@@ -1,6 +1,7 @@
 """Heat that follows a channel that no load reads: attitude-steered sunlight, an instrument mode, a table position, a power."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -10,7 +11,7 @@ from twin_core.effects.base import Beyond, Effect, ParameterSpec, Survey, Where
 from twin_core.network.model import Addition, Layout
 from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
-from twin_core.network.terms import Along, ChannelLoad, SteeredTable, TableLoad, nearest
+from twin_core.network.terms import Along, ChannelLoad, SteeredTable, TableLoad, nearest, table_basis
 from twin_core.orbit.environment import BETA
 
 N_KNOTS = 6
@@ -112,6 +113,22 @@ class ChannelHeatLoad(Effect):
             for some in sorted(knots, key=len):
                 yield self._null(self.where, {"knots": some, "levels": False})
 
+    def simplified(self, survey: Survey) -> Iterable[Self]:
+        """Yield the table about no mean over the record: one value is held, for only their differences count."""
+        if "across" in self.settings or self._is_in_proportion or self.held:
+            return
+        knots, levels = tuple(self.settings["knots"]), bool(self.settings["levels"])
+        visits = table_basis(survey.along.inputs[self.where["channel"]], knots, levels).mean(axis=0)
+        held = self.holding(self.parameter_specs()[int(visits.argmax())].name)
+        yield replace(held, settings={**held.settings, "visits": tuple(visits.tolist())})
+
+    def centred(self, survey: Survey) -> Self:
+        """Return a table about no mean with each value as the heat that flows there."""
+        if "visits" not in self.settings:
+            return self
+        mean_W = float(np.dot(self.settings["visits"], [self.values[q.name] for q in self.parameter_specs()]))
+        return self.with_values({q.name: self.values[q.name] - mean_W for q in self.parameter_specs()})
+
     def addition(self, layout: Layout) -> Addition:
         """Return the table."""
         own, node, channel = self.settings, layout.node(self.where["node"]), self.where["channel"]
@@ -119,7 +136,9 @@ class ChannelHeatLoad(Effect):
         if self._is_in_proportion:
             return Addition((ChannelLoad(node, channel, 1.0 / knots[0], False, parameters),))
         if "across" not in own:
-            return Addition((TableLoad(node, channel, knots, bool(own["levels"]), 1.0, False, parameters),))
+            visits = tuple(own.get("visits", ()))
+            table = TableLoad(node, channel, knots, bool(own["levels"]), 1.0, False, parameters, visits=visits)
+            return Addition((table,))
         solar, states, rests = bool(own["solar"]), tuple(own["states"]), tuple(own["levels"])
         table = SteeredTable(
             node, own["across"], knots, False, 1.0, solar, parameters, (), None, states, channel, rests

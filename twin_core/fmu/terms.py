@@ -120,6 +120,9 @@ def _heat(term: Term, names: Names, what: str, effect: str) -> Iterator[str]:
             )
             table, places = ", ".join(p), ", ".join(map(repr, knots))
             lookup = f"{'nearest' if levels else 'linear'}({names.u(x)}, {len(knots)}, knots, values)"
+            if term.visits:
+                mean = " + ".join(f"{share!r} * {value}" for share, value in zip(term.visits, p, strict=True))
+                lookup = f"({lookup} - ({mean}))"
             yield (f"{{ const double knots[] = {{{places}}}, values[] = {{{table}}}; Q[{a}] += {weight} * {lookup}; }}")
         case ConstantHeat(node=a):
             yield f"Q[{a}] += {p[0]};"

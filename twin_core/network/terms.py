@@ -433,7 +433,10 @@ class ChannelLoad:
 
 @dataclass(frozen=True)
 class TableLoad:
-    """Heat as a function of an auxiliary channel: hat functions over knots, or one value per level."""
+    """Heat as a function of an auxiliary channel: hat functions over knots, or one value per level.
+
+    Where ``visits`` tell the share of a record that each value counts for, it is the heat about its mean over that record.
+    """
 
     node: int
     channel: str
@@ -444,14 +447,17 @@ class TableLoad:
     parameters: tuple[Parameter, ...]
     borrows: tuple[str, ...] = ()
     factor: str | None = None
+    visits: tuple[float, ...] = field(default=(), kw_only=True)
 
     def basis(self, along: Along) -> FloatArray:
         """Return how much each value counts at each point, (n_points, n_values)."""
-        return table_basis(along.inputs[self.channel], self.knots, self.levels)
+        basis = table_basis(along.inputs[self.channel], self.knots, self.levels)
+        return basis - np.array(self.visits) if self.visits else basis
 
     def looked_up(self, along: Along, values: FloatArray) -> FloatArray:
         """Return the table at each point, (n_points,): ``basis @ values`` without the basis."""
-        return table_values(along.inputs[self.channel], self.knots, values, self.levels)
+        heat = table_values(along.inputs[self.channel], self.knots, values, self.levels)
+        return heat - np.dot(self.visits, values) if self.visits else heat
 
     def evaluate(self, along: Along, values: FloatArray) -> Heat:
         """Evaluate the table; it is linear in its values."""

@@ -76,6 +76,10 @@ class Stub:
     def __post_init__(self) -> None:
         self.fit = Fit(Problem(self.n_free))
 
+    @property
+    def present_effects(self) -> tuple[Effect, ...]:
+        return self.effects
+
     def excess(self) -> Any:
         return np.array([2.0 * self.left, 0.0])
 

@@ -291,6 +291,27 @@ def test_a_correction_is_told_by_its_own_trajectories(
     assert judge.examine(simple, option, NEEDED)[0].reason == reason
 
 
+def test_an_option_is_examined_without_what_readings_do_not_pay_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It gains what it no longer pays for, and is told so that the search goes on from there."""
+    option, less, asked = judged("a", 90.0), stub(load("a")), []
+
+    def validated(simple: Trial, rich: Trial) -> Validation | None:
+        asked.append(rich)
+        return option.validation
+
+    monkeypatch.setattr(Stub, "calibration", lambda own: SimpleNamespace(log_posterior=0.0), raising=False)
+    monkeypatch.setattr(judge, "without_spare", lambda simple, rich: less)
+    monkeypatch.setattr(judge, "weigh", lambda simple, rich, n_tried: Evidence(-3.0, 1.0))
+    monkeypatch.setattr(judge, "validate", validated)
+    monkeypatch.setattr(judge, "least_wald_score", lambda *trials: np.inf)
+    monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: None)
+    monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
+    examined, _ = judge.examine(stub(), option, NEEDED)
+    assert examined.trial is less and asked == [less]
+    assert examined.evidence.log_bayes_factor == 93.0
+    assert not examined.reason
+
+
 @pytest.mark.parametrize(("rate", "score"), [(0.05, 1.959964), (0.01, 2.575829), (0.001, 3.290527)])
 def test_the_score_asked_for_is_that_of_normal_tables(rate: float, score: float) -> None:
     assert score_needed(threshold(rate)) == pytest.approx(score, abs=1e-6)

@@ -4,8 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
+from tests.helpers import survey_of as survey_of_points
 from twin_core.calibrate.second_order import fit_network
 from twin_core.calibrate.summary import to_model
 from twin_core.discover.screen import survey_of
@@ -122,6 +125,35 @@ def test_beyond_its_knots_a_curve_says_so() -> None:
     assert beyond.visited == "angle 10 to 30"
     levels = ChannelHeatLoad(PLACE, values, {"knots": (10.0, 20.0, 30.0), "levels": True})
     assert levels.beyond(network.layout, along) is None
+
+
+@given(
+    values=st.lists(st.floats(-50.0, 50.0), min_size=4, max_size=4),
+    angle=st.lists(st.floats(0.0, 180.0), min_size=5, max_size=40),
+    levels=st.booleans(),
+)
+def test_about_no_mean_a_table_brings_in_nothing_over_its_record(
+    values: list[float], angle: list[float], levels: bool
+) -> None:
+    """Whatever its values are; centred, each is the heat that flows there, and the heat stays as it was."""
+    settings = {"knots": (0.0, 60.0, 120.0, 180.0), "levels": levels}
+    table = ChannelHeatLoad(PLACE, {f"values_W[{i}]": v for i, v in enumerate(values)}, settings)
+    network, n = build_network(SPEC), len(angle)
+    inputs = {"angle": np.array(angle), "Q": np.zeros(n)}
+    along = Along(np.arange(float(n)), np.full((n, 1), 280.0), np.full((n, 1), WALL_K), inputs, np.ones(n))
+    survey = survey_of_points(network, along)
+    (form,) = table.simplified(survey)
+    assert form.n_free == 3 and not list(form.simplified(survey))
+    heats = []
+    for one in (table, form, form.centred(survey)):
+        (term,) = one.addition(network.layout).terms
+        heats.append(term.evaluate(along, np.array([p.value for p in one.parameters()])).heat_W[:, 0])
+    whole, alone, centred = heats
+    np.testing.assert_allclose(alone, whole - whole.mean(), atol=1e-9)
+    np.testing.assert_allclose(centred, alone, atol=1e-9)
+    told = np.array([form.centred(survey).values[f"values_W[{i}]"] for i in range(4)])
+    assert abs(np.dot(form.settings["visits"], told)) < 1e-9
+    assert table.centred(survey) == table
 
 
 def test_a_limit_that_was_never_reached_is_unbounded_above() -> None:

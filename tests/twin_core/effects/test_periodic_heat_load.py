@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.helpers import every_term_network, points, survey_of
-from twin_core.effects import REGISTRY
+from twin_core.effects import REGISTRY, effect_from_json, effect_to_json
 
 LOAD = REGISTRY["periodic_heat_load"]
 SETTINGS = {"origin_s": 600.0, "dated": False}
@@ -18,6 +18,21 @@ def test_its_heat_by_hand() -> None:
     (term,) = effect.addition(network.layout).terms
     heat = term.evaluate(points(network, 10), np.array([2.0, 3.0, -1.0, 480.0])).heat_W[:, 0]
     np.testing.assert_allclose(heat[5:10], [1.0, 5.0, 3.0, -1.0, 1.0], atol=1e-12)  # a quarter of a period each
+
+
+def test_about_no_mean_it_has_three_unknowns_and_the_same_heat_but_for_the_mean() -> None:
+    effect = LOAD({"node": "b"}, {"Q_W": 2.0, "A_W": 3.0, "B_W": -1.0, "P_s": 480.0}, SETTINGS)
+    network = every_term_network([effect])
+    survey = survey_of(network, points(network, 10))
+    (form,) = effect.simplified(survey)
+    assert (form.held, form.n_free, form.amplitudes) == (("Q_W",), 3, (1, 2))
+    assert [p.name for p in form.parameters() if p.frozen] == [f"{form.label}.Q_W"]
+    assert not list(form.simplified(survey))
+    assert effect_from_json(effect_to_json(form), 0) == form
+    (term,), along = form.addition(network.layout).terms, points(network, 10)
+    whole = effect.addition(network.layout).terms[0].evaluate(along, np.array([2.0, 3.0, -1.0, 480.0]))
+    alone = term.evaluate(along, np.array([p.value for p in form.parameters()]))
+    np.testing.assert_allclose(alone.heat_W, whole.heat_W - 2.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("node", ["a", "c"])

@@ -70,6 +70,17 @@ EFFECTS: list[dict[str, Any]] = [
     {"effect": "nonlinear_convection", "where": {"node": "a", "boundary": "room"}, "values": {"k": 0.3, "p": 1.25}},
     {"effect": "input_gain", "where": {"channel": "Q"}, "values": {"g": 0.9}},
     {"effect": "constant_heat_load", "where": {"node": "b"}, "values": {"Q_W": 2.5}},
+    {
+        "effect": "channel_heat_load",
+        "where": {"node": "c", "channel": "pitch"},
+        "values": {"values_W[0]": 3.0, "values_W[1]": -2.0, "values_W[2]": 5.0},
+        "settings": {
+            "knots": [40, 110, 180],
+            "levels": False,
+            "held": ["values_W[1]"],
+            "visits": [0.5, 0.3, 0.2],
+        },
+    },
     {"effect": "sensor_lag", "where": {"sensor": "T_b"}, "values": {"tau_s": 400.0}},
     {"effect": "boundary_offset", "where": {"boundary": "room"}, "values": {"b_K": 1.5}},
 ]

@@ -107,6 +107,7 @@ def test_a_table_is_the_same_without_its_derivatives(knots: list[int], x: list[f
     parameters = tuple(real(f"f{i}", "W", 0.0) for i in range(len(own)))
     for table in (
         TableLoad(0, "x", own, levels, 0.5, True, parameters),
+        TableLoad(0, "x", own, levels, 0.5, True, parameters, visits=tuple(np.full(len(own), 1.0 / len(own)))),
         SteeredTable(0, "x", own, levels, 0.5, True, parameters, (), None, (1.0,) * len(own), "mode", (0.0, 1.0)),
     ):
         told = table.evaluate(along, values)
