@@ -1,16 +1,11 @@
-"""The closed loop on photovoltaic arrays in the field: modules and inverters under clouds, wind, night skies and snow.
+"""Photovoltaic arrays in the field: modules and inverters under clouds, wind, night skies and snow, as splits of a benchmark.
 
-``python -m benchmarks.photovoltaic --data DIR [--only SUBSTRING ...] [--deadline S] [--processes N]`` closes the loop on each
-device, with several shares of the record held out, each in a process of its own, and saves
-``benchmarks/tables/photovoltaic.md``. DIR is ``pvanalytics/data`` of the package of that name: ``pip download --no-deps
-pvanalytics==0.2.2``, then unzip the wheel. Readings are quarter-hourly, longer than a module takes to settle; what wind and a
-clear sky take away is not declared, and in each record snow falls.
+The folder is ``pvanalytics/data`` of the package of that name: ``pip download --no-deps pvanalytics==0.2.2``, then unzip the
+wheel. Readings are quarter-hourly, longer than a module takes to settle; what wind and a clear sky take away is not declared,
+and in each record snow falls on a part of what is held out.
 """
 
-import argparse
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,21 +13,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.markdown import save_table
-from benchmarks.measured_run import THREADS, Result, compile_all, measure, sources, supervised
 from benchmarks.measured_splits import Prepared, Split, published
-from benchmarks.measured_table import in_one_line, main_table
 from twin_core.constants import ZERO_CELSIUS_K
 from twin_core.network.spec_io import load_spec
 from twin_core.telemetry import Record
 
-TITLE = "Closed loop on photovoltaic arrays, held-out rmse"
-DEADLINE_S = 180.0
 HELD_OUT = (0.2, 0.3, 0.4, 0.5)
-LEGEND = (
-    "`before` is the declared model at its best, `after` the one with what was found; both are open-loop rollouts. Snow"
-    " falls on a part of what is held out, of which no training part tells."
-)
 
 COLUMNS = {
     "serf_west_15min.csv": {
@@ -137,53 +123,3 @@ SPLITS = tuple(
     for device in DEVICES
     for share in HELD_OUT
 )
-
-
-def summary(results: Sequence[Result]) -> str:
-    """Return how many runs came to what, in one sentence."""
-    found = [r for r in results if r.verdict == "effect_added"]
-    better, worse = (sum(r.is_worse is worse for r in found) for worse in (False, True))
-    crashed, hung = sum(r.crashed for r in results), sum(r.hung for r in results)
-    return (
-        f"Of {len(results)} runs {crashed} crashed, {hung} hung; in {len(found)} something was found: {better} of these predict"
-        f" the hold-out better or as well, {worse} worse."
-    )
-
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the benchmark from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, required=True, help="folder of the files")
-    parser.add_argument(
-        "--only", nargs="+", default=[""], metavar="SUBSTRING", help="only splits with this in their name"
-    )
-    parser.add_argument("--deadline", type=float, default=DEADLINE_S, metavar="S", help="seconds for each search")
-    parser.add_argument("--processes", type=int, default=1, metavar="N", help="searches at a time")
-    given = parser.parse_args(words)
-    os.environ.update(dict.fromkeys(THREADS, "1"))  # the processes that are started below inherit it
-    absent = [name for name in COLUMNS if not (given.data / name).is_file()]
-    if absent:
-        parser.error(f"--data: {given.data} lacks {', '.join(absent)}")
-    splits = [s for s in SPLITS if any(word.lower() in s.name.lower() for word in given.only)]
-    if not splits:
-        parser.error(f"--only: no split has {' or '.join(given.only)} in its name")
-    code = sources()
-    compile_all()
-
-    def run(split: Split) -> Result:
-        work = partial(measure, split, given.data, code, given.deadline)
-        result = supervised(split.name, work, code, given.deadline)
-        print(in_one_line(result), flush=True)
-        return result
-
-    with ThreadPoolExecutor(given.processes) as pool:
-        results = list(pool.map(run, splits))
-    page = f"{main_table(results, {})}\n{LEGEND}\n\n{summary(results)}\n"
-    if given.only == [""]:
-        save_table("photovoltaic", TITLE, page, "benchmarks.photovoltaic")
-    else:
-        print(page)
-
-
-if __name__ == "__main__":
-    main()
