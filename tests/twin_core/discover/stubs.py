@@ -72,13 +72,11 @@ class Stub:
     beside: float | None = None
     nats: float = 0.0
     fit: Fit = field(init=False)
+    present_effects: tuple[Effect, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         self.fit = Fit(Problem(self.n_free))
-
-    @property
-    def present_effects(self) -> tuple[Effect, ...]:
-        return self.effects
+        self.present_effects = self.effects
 
     def excess(self) -> Any:
         return np.array([2.0 * self.left, 0.0])
