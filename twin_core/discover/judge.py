@@ -312,10 +312,18 @@ def _examined(
 def examine(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
     """Return an option with how it predicts, the reason why it cannot be named if there is one, and whether it is no law.
 
-    It is examined, and returned, without what the readings do not speak for. A correction is handed out as trajectories: one
-    that wandering heat alone supports must not make these less likely.
+    What passes must pass without the amplitudes that the readings do not pay for too, and is returned without them.
     """
-    judged = _without_spare(simple, judged)
+    examined = _as_it_is(simple, judged, needed)
+    less = judged if examined[0].reason else _without_spare(simple, judged)
+    return examined if less is judged else _as_it_is(simple, less, needed)
+
+
+def _as_it_is(simple: Trial, judged: Judged, needed: float) -> tuple[Judged, bool]:
+    """Return the same of an option with all that it has.
+
+    A correction is handed out as trajectories: one that wandering heat alone supports must not make these less likely.
+    """
     if judged.trial.calibration().log_posterior < simple.calibration().log_posterior:
         return replace(judged, reason=LESS_LIKELY), False
     if least_wald_score(simple, judged.trial) < score_needed(needed):

@@ -291,13 +291,20 @@ def test_a_correction_is_told_by_its_own_trajectories(
     assert judge.examine(simple, option, NEEDED)[0].reason == reason
 
 
-def test_an_option_is_examined_without_what_readings_do_not_pay_for(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("foresight", "without", "reason", "n_asked"),
+    [(0.5, 0.6, "", 2), (0.5, 1.0, NO_FORESIGHT, 2), (1.0, 0.5, NO_FORESIGHT, 1)],
+    ids=["passes", "predicts by what is not paid for", "refused as it is"],
+)
+def test_what_passes_must_pass_without_what_readings_do_not_pay_for(
+    monkeypatch: pytest.MonkeyPatch, foresight: float, without: float, reason: str, n_asked: int
+) -> None:
     """It gains what it no longer pays for, and is told so that the search goes on from there."""
     option, less, asked = judged("a", 90.0), stub(load("a")), []
 
-    def validated(simple: Trial, rich: Trial) -> Validation | None:
+    def validated(simple: Trial, rich: Trial) -> SimpleNamespace:
         asked.append(rich)
-        return option.validation
+        return SimpleNamespace(foresight=without if rich is less else foresight)
 
     monkeypatch.setattr(Stub, "calibration", lambda own: SimpleNamespace(log_posterior=0.0), raising=False)
     monkeypatch.setattr(judge, "without_spare", lambda simple, rich: less)
@@ -307,9 +314,9 @@ def test_an_option_is_examined_without_what_readings_do_not_pay_for(monkeypatch:
     monkeypatch.setattr(judge, "coinciding_channel", lambda *arguments: None)
     monkeypatch.setattr(judge, "_merely_resembles", lambda *arguments: "")
     examined, _ = judge.examine(stub(), option, NEEDED)
-    assert examined.trial is less and asked == [less]
-    assert examined.evidence.log_bayes_factor == 93.0
-    assert not examined.reason
+    assert (examined.reason, len(asked)) == (reason, n_asked)
+    assert examined.trial is asked[-1] is (less if n_asked > 1 else option.trial)
+    assert examined.evidence.log_bayes_factor == 90.0 + 3.0 * (n_asked - 1)
 
 
 @pytest.mark.parametrize(("rate", "score"), [(0.05, 1.959964), (0.01, 2.575829), (0.001, 3.290527)])
