@@ -1,4 +1,4 @@
-"""Spare freedom: what readings do not speak for is taken from an effect before its predictions are examined."""
+"""Spare freedom: an effect without the amplitudes that readings do not speak for, which must hold as well."""
 
 from dataclasses import replace
 
