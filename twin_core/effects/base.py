@@ -497,6 +497,7 @@ def read(kind: type[Effect], data: Json, field: str) -> Effect:
         settings = {k: tuple(v) if isinstance(v, list) else v for k, v in parts["settings"].items()}
         effect = kind(dict(parts["where"]), {k: float(v) for k, v in parts["values"].items()}, settings)
         lacking = [q.name for q in effect.parameter_specs() if q.name not in effect.values]
+        unknown = set(effect.held) - {q.name for q in effect.parameter_specs()}
     except ModelError as error:
         raise SpecError(f"{field}: {error}") from error
     except KeyError as error:
@@ -505,4 +506,6 @@ def read(kind: type[Effect], data: Json, field: str) -> Effect:
         raise SpecError(f"{field}.values: must be numbers ({error})") from error
     if lacking:
         raise SpecError(f"{field}.values.{lacking[0]}: is missing")
+    if unknown:
+        raise SpecError(f"{field}.settings.held: {min(unknown, key=str)!r} is none of its values")
     return effect

@@ -8,6 +8,7 @@ import numpy as np
 
 from twin_core._typing import BoolArray, FloatArray
 from twin_core.effects.base import Beyond, Effect, ParameterSpec, Survey, Where
+from twin_core.errors import ModelError
 from twin_core.network.model import Addition, Layout
 from twin_core.network.orbit_block import PREFIX
 from twin_core.network.spec import Load
@@ -137,6 +138,10 @@ class ChannelHeatLoad(Effect):
             return Addition((ChannelLoad(node, channel, 1.0 / knots[0], False, parameters),))
         if "across" not in own:
             visits = tuple(own.get("visits", ()))
+            if len(visits) not in (0, len(knots)):
+                raise ModelError(
+                    f"{self.label}: settings.visits must hold {len(knots)} shares, one for each knot, or none"
+                )
             table = TableLoad(node, channel, knots, bool(own["levels"]), 1.0, False, parameters, visits=visits)
             return Addition((table,))
         solar, states, rests = bool(own["solar"]), tuple(own["states"]), tuple(own["levels"])

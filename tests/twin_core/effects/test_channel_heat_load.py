@@ -1,5 +1,6 @@
 """A heat over a smooth curve: SciPy integrates one block that an angle heats, the number of knots is left to the evidence."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -14,8 +15,10 @@ from twin_core.calibrate.summary import to_model
 from twin_core.discover.screen import survey_of
 from twin_core.discover.shortlist import refined
 from twin_core.discover.trial import Trial, try_effects
+from twin_core.effects import effect_from_json, effect_to_json
 from twin_core.effects.channel_heat_load import ChannelHeatLoad
 from twin_core.effects.proportional_heater import ProportionalHeater
+from twin_core.errors import ModelError, SpecError
 from twin_core.network.model import build_network
 from twin_core.network.spec_io import load_spec
 from twin_core.network.terms import Along
@@ -154,6 +157,16 @@ def test_about_no_mean_a_table_brings_in_nothing_over_its_record(
     told = np.array([form.centred(survey).values[f"values_W[{i}]"] for i in range(4)])
     assert abs(np.dot(form.settings["visits"], told)) < 1e-9
     assert table.centred(survey) == table
+
+
+def test_what_a_file_holds_wrongly_is_told_by_its_field() -> None:
+    table = ChannelHeatLoad(PLACE, {"values_W[0]": 1.0, "values_W[1]": 2.0}, {"knots": (0.0, 9.0), "levels": False})
+    data = effect_to_json(table)
+    with pytest.raises(SpecError, match=r"settings\.held: 'values_W\[7\]' is none of its values"):
+        effect_from_json({**data, "settings": {**data["settings"], "held": ["values_W[7]"]}}, 0)
+    wrong = replace(table, settings={**table.settings, "visits": (1.0,)})
+    with pytest.raises(ModelError, match=r"settings\.visits must hold 2 shares"):
+        wrong.addition(build_network(SPEC).layout)
 
 
 def test_a_limit_that_was_never_reached_is_unbounded_above() -> None:
